@@ -26,10 +26,9 @@ from neurosim_core.render.candidate_lists import frustum_search_kernel
 from neurosim_core.render.kernel_data import BLOCK, RenderTerms
 from neurosim_core.render.outputs import OUTPUTS
 from neurosim_core.render.raycast import fallback_kernel, raycast_kernel
-from neurosim_core.sensors.displacement_kernels import rule_kernels
-from neurosim_core.sensors.event_kernels import make_noisy_scan
 from neurosim_core.sensors.event_noise_model import TERMS
 from neurosim_core.sensors.event_noise_pixel import make_begin, signal_terms
+from neurosim_core.sensors.event_noise_scan import make_noisy_scan
 from neurosim_core.sensors.imu import TERMS as IMU_TERMS
 from neurosim_core.sensors.imu import make_kernel as make_imu
 from neurosim_core.sim.trace import record_state
@@ -105,8 +104,6 @@ def make_kernels() -> None:
     for terms in (quads, quads._replace(bodies=True, timed=True, **worlds)):
         raycast_kernel(("log_radiance", "rgb"), terms)
     frustum_search_kernel(BLOCK)
-    for moving in (False, True):
-        rule_kernels(moving)
     for pixel in ([], TERMS[:-1], TERMS, *([term] for term in TERMS)):
         make_noisy_scan(frozenset(pixel))
     make_begin(signal_terms(TERMS))

@@ -36,7 +36,8 @@ from neurosim_core.settings_file import ConfigError, beside, merge, nest, read_f
 from neurosim_core.sinks import SinkConfig, check_files, default_sinks
 from neurosim_core.trajectory import CollisionFreeConfig, PathConfig, TourConfig
 from neurosim_core.vehicle import MultirotorConfig
-from neurosim_core.vehicle.config import MultirotorVehicleConfig, VehicleConfig
+from neurosim_core.vehicle.base import VehicleConfig
+from neurosim_core.vehicle.multirotor import MultirotorVehicleConfig
 
 
 def default_sensors() -> dict[str, SensorConfig]:

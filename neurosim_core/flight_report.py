@@ -20,7 +20,7 @@ from neurosim_core.sensors.render_plan import RenderGroup
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.render_group import render_terms
 from neurosim_core.sim.state import State
-from neurosim_core.vehicle.config import MultirotorVehicleConfig
+from neurosim_core.vehicle.multirotor import MultirotorVehicleConfig
 
 
 @dataclass(kw_only=True, eq=False)

@@ -26,8 +26,8 @@ SEAMS = ("sensor", "vehicle", "controller", "renderer", "scene", "sink", "noise"
 """What can be registered."""
 
 _OWN = {
-    "vehicle": {"multirotor": "vehicle.config"},
-    "controller": {"se3": "control.config"},
+    "vehicle": {"multirotor": "vehicle.multirotor"},
+    "controller": {"se3": "control.base"},
     "scene": {"apartment": "scene.apartment", "hall": "scene.hall", "mesh": "scene.mesh"},
     "renderer": {"warp": "render.renderer", "remote": "live.remote_renderer"},
     "sink": {"hdf5": "sinks", "cortex": "live.sink"},

@@ -1,4 +1,4 @@
-"""Settings files as they are written: YAML, and keys that win over those of a file. Nothing is checked."""
+"""YAML files as they are written: tables, and settings with keys that win over them. Nothing is checked."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # PyYAML may be built without libyaml
 
 
 class ConfigError(ValueError):
@@ -45,6 +47,13 @@ def read_file(path: Path) -> dict[str, Any]:
     if not isinstance(raw, dict):
         raise ConfigError(f"{path} must hold a mapping of keys to values, got a {type(raw).__name__}")
     return raw
+
+
+@functools.cache
+def read_table(module_file: str, name: str) -> dict[str, Any]:
+    """Return the table `name`.yaml beside a module, whose `__file__` is given."""
+    table: dict[str, Any] = yaml.load(Path(module_file).with_name(f"{name}.yaml").read_bytes(), _LOADER)
+    return table
 
 
 def nest(key: str, value: Any) -> dict[str, Any]:

@@ -1,13 +1,13 @@
 """Control: geometric tracking on SE(3) in six command modes, for one vehicle or thousands."""
 
-from neurosim_core.control.config import (
+from neurosim_core.control.base import (
     ControllerConfig,
     ControllerContext,
+    HostController,
     PathController,
     Se3ControllerConfig,
 )
 from neurosim_core.control.follow import FollowMode, PathFollower
-from neurosim_core.control.host_controller import HostController
 from neurosim_core.control.modes import MODES, CommandMode, Controller, Mode, mode_kernel
 from neurosim_core.control.se3 import Se3Config
 

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from neurosim_core.control.config import (
+from neurosim_core.control.base import (
     ControllerConfig,
     ControllerContext,
     PathController,

@@ -10,7 +10,7 @@ import contextlib
 import functools
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from cortex import Node
@@ -170,6 +170,7 @@ class Simulator:
             RuntimeError: The cameras failed.
         """
         self._stop = stop
+        fly = self._fly_streaming if self._is_streaming else self._fly_lockstep
         while not stop.is_set() and self._exit is None:
             self._answer_requests()
             self._housekeep()
@@ -178,10 +179,12 @@ class Simulator:
                     self._streaming.publish_rendered(self.stamp_ns)
                 self._wakeup.wait(POLL_S)
                 self._wakeup.clear()
-            elif self._is_streaming:
-                self._fly_streaming()
             else:
-                self._fly_lockstep()
+                try:
+                    fly()
+                except DynamicsError as error:
+                    name = next(v.name for v in self.vehicles if v.state.failure is error)
+                    self._end(f"the motion of {name} cannot be computed: {error}")
         if not self._is_ended:
             self._flush()
         self._publish_status(at_once=True)
@@ -209,31 +212,16 @@ class Simulator:
             return
         begin_ns = time.monotonic_ns()
         end_ns = self._control.stamp_ns(self._tick + 1)
-        try:
-            self._step(self.vehicles)
-        except DynamicsError as error:
-            self._end_with(error)
-            return
+        with contextlib.ExitStack() as ends:  # each step that has begun is ended, whatever another one raises
+            for vehicle in self.vehicles:  # on a CUDA device, all at the same time
+                ends.callback(vehicle.begin_step(self.stamp_ns))
+            self._housekeep()  # while the device works
         report_touches(self.vehicles, self._touching)
         self._stats.step_times.add(time.monotonic_ns() - begin_ns)
         self._publish_end(end_ns)
         for vehicle in self.vehicles:
             vehicle.prepare_step()
         self._end_period(end_ns)
-
-    def _step(self, vehicles: Sequence[VehicleNode]) -> None:
-        """Fly a control period; on a CUDA device, all vehicles at the same time.
-
-        Each step that has begun is ended, whatever another one raises.
-        """
-        if not vehicles:
-            self._housekeep()  # while the device works
-            return
-        end_step = vehicles[0].begin_step(self.stamp_ns)
-        try:
-            self._step(vehicles[1:])
-        finally:
-            end_step()
 
     def _fly_streaming(self) -> None:
         """Fly a control period, and publish its packets when they are due."""
@@ -242,11 +230,7 @@ class Simulator:
         begin_ns = time.monotonic_ns()
         end_ns = self._control.stamp_ns(self._tick + 1)
         if not self._is_flown:
-            try:
-                if not self._streaming.fly(self.stamp_ns, end_ns):
-                    return
-            except DynamicsError as error:
-                self._end_with(error)
+            if not self._streaming.fly(self.stamp_ns, end_ns):
                 return
             report_touches(self.vehicles, self._touching)
             self._stats.step_times.add(time.monotonic_ns() - begin_ns)
@@ -378,10 +362,6 @@ class Simulator:
         self._flush()
         if not self.config.live.run_on:
             self._exit = 0
-
-    def _end_with(self, error: DynamicsError) -> None:
-        name = next(v.name for v in self.vehicles if v.state.failure is error)
-        self._end(f"the motion of {name} cannot be computed: {error}")
 
     def _flush(self) -> None:
         """Publish what is known, including the events of windows that have not ended.

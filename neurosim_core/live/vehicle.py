@@ -160,7 +160,7 @@ class VehicleNode:
             in_flight=1,
             render_backlog=pending,
             borrow_pictures=self._lockstep,
-            make_room=self.publisher.acquire_buffer if self._writes_in_place else None,
+            allocate_picture=self.publisher.acquire_buffer if self._writes_in_place else None,
             seed=seed,
             start=start,
         )
@@ -187,7 +187,7 @@ class VehicleNode:
         """Prepare the next control period of lockstep while others read the last one."""
         if not self._writes_in_place:
             self._plan_step()
-        sim.acquire_rooms(self.state)
+        sim.acquire_next_picture_buffers(self.state)
 
     def _plan_step(self) -> None:
         self._choose_cameras()

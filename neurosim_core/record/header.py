@@ -92,7 +92,7 @@ def _describe(name: str, sensor: Any) -> SensorDescription:
     more: dict[str, Any] = {}
     if mount is not None:
         more["position"] = np.array(mount.position_m)
-        more["orientation"] = mount.rotation().as_quat() if lens is None else mount.optical_quaternion()
+        more["orientation"] = mount.quaternion() if lens is None else mount.optical_quaternion()
     if lens is not None:
         more["intrinsics"] = Intrinsics(
             width=lens.width,

@@ -239,13 +239,13 @@ class HostCopy:
             offset, size = first * self._row_size, count * self._row_size
             wp.copy(self._host, self._array, dest_offset=offset, src_offset=offset, count=size)
 
-    def fetch_into(self, room: NDArray[Any], row: int) -> None:
+    def fetch_into(self, buffer: NDArray[Any], row: int) -> None:
         """Launch the copy of one row into memory of the caller's; on a CPU it is done at once.
 
-        The room is contiguous, like a row; on CUDA pinned, and left alone until the device has come past
+        The buffer is contiguous, like a row; on CUDA pinned, and left alone until the device has come past
         this.
         """
-        address = room.__array_interface__["data"][0]
+        address = buffer.__array_interface__["data"][0]
         place = self._places.get(address)
         if place is None:
             if len(self._places) >= _PLACES_MAX:

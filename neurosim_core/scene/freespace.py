@@ -165,7 +165,7 @@ _GROUND_SLACK_M = 0.01  # how far a floor may be above the plane meant by it
 
 
 @wp.func
-def room_around(
+def clearance_around(
     field: DistanceField, radius_m: float, exact_below: float, ground_height_m: wp.float64, p: wp.vec3d
 ) -> float:
     """Return how much room a sphere has around it [m], negative: it touches.
@@ -324,7 +324,7 @@ def make_free_space(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") 
     Raises:
         ValueError: The seed of the configuration is not in free space, or the scene has none.
     """
-    return choose_seed(map_distances(scene, config, device), scene, config)
+    return choose_seed(map_distances(scene, config, device), config, inside_m=scene.inside_m)
 
 
 def map_distances(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") -> FreeSpace:
@@ -372,12 +372,15 @@ def map_distances(scene: Scene, config: FreeSpaceConfig, device: str = "cpu") ->
     )
 
 
-def choose_seed(unseeded: FreeSpace, scene: Scene, config: FreeSpaceConfig) -> FreeSpace:
-    """Return what `map_distances` has mapped with the seed of its free space; see `make_free_space`."""
+def choose_seed(unseeded: FreeSpace, config: FreeSpaceConfig, *, inside_m: Vector3 | None) -> FreeSpace:
+    """Return what `map_distances` has mapped with the seed of its free space; see `make_free_space`.
+
+    `inside_m`: as of the scene.
+    """
     bounds, notes = unseeded.bounds_m, list(unseeded.notes)
     known = _Seed(np.array(config.seed_m), "seed_m of the configuration") if config.seed_m else None
-    if known is None and scene.inside_m is not None:
-        known = _Seed(np.array(scene.inside_m), "the point that the scene names as inside")
+    if known is None and inside_m is not None:
+        known = _Seed(np.array(inside_m), "the point that the scene names as inside")
     seed = _find_seed(unseeded) if known is None else known
     if known is not None and (room := float(unseeded.clearance(known.point)[0])) <= unseeded.voxel_m:
         if config.seed_m is not None:
@@ -388,7 +391,7 @@ def choose_seed(unseeded: FreeSpace, scene: Scene, config: FreeSpaceConfig) -> F
         is_outside = bool(((known.point < bounds[0]) | (known.point > bounds[1])).any())
         spans = f"it spans {bounds[0].round(2).tolist()} to {bounds[1].round(2).tolist()} m"
         why = spans if is_outside else f"a surface is {abs(room):.3f} m from there"
-        notes.append(f"The scene names {scene.inside_m} as inside, but {why}.")
+        notes.append(f"The scene names {inside_m} as inside, but {why}.")
         seed = _find_seed(unseeded)
     place = np.round(seed.point, 2).tolist()
     return dataclasses.replace(

@@ -21,40 +21,39 @@ _SAMPLES = 4096
 _CELL_MAX = 300_000
 
 
-def surface_samples(triangles: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Return points spread over triangles [F, 3, 3] in proportion to area, shape [count, 3].
+def surface_samples(corners: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Return points spread over triangles [axis, corner, F] in proportion to area, shape [axis, count].
 
     A low-discrepancy sequence: the same triangles give the same points.
     """
     index = np.arange(count)
-    total = np.cumsum(double_areas(triangles.T))
-    face = np.minimum(np.searchsorted(total, (index + 0.5) / count * total[-1]), len(triangles) - 1)
+    total = np.cumsum(double_areas(corners))
+    face = np.minimum(np.searchsorted(total, (index + 0.5) / count * total[-1]), len(total) - 1)
     a = np.sqrt((index * 0.7548776662466927) % 1.0)  # Roberts' R2 sequence
     b = (index * 0.5698402909980532) % 1.0
     weights = 1.0 - a, a * (1.0 - b), a * b
-    columns = np.ascontiguousarray(triangles.T)  # [axis, corner, F]
-    return dot(weights, columns.take(face, axis=2).swapaxes(0, 1)).T
+    return dot(weights, corners.take(face, axis=2).swapaxes(0, 1))
 
 
 def _level(
     positions: NDArray[np.float64], intensities: NDArray[np.float64], samples: NDArray[np.float64]
 ) -> float:
     """Return the median over `samples` of the brightest light's intensity / distance^2."""
-    squared = ((samples[:, None] - positions[None]) ** 2).sum(axis=2)
+    squared = ((samples.T[:, None] - positions[None]) ** 2).sum(axis=2)
     return float(np.median((intensities.mean(axis=1) / np.maximum(squared, 0.01)).max(axis=1)))
 
 
 def scaled_lights(
     positions: Sequence[NDArray[np.float64]],
     intensities: Sequence[LinearRgb],
-    triangles: NDArray[np.float64],
+    corners: NDArray[np.float64],
     *,
     factor: float | None,
 ) -> tuple[tuple[Light, ...], float]:
     """Return lights and the factor that was applied: `factor`, or the one that brings them to `LEVEL`."""
     where, power = np.asarray(positions, dtype=np.float64), np.asarray(intensities, dtype=np.float64)
     if factor is None:
-        factor = LEVEL / max(_level(where, power, surface_samples(triangles, _SAMPLES)), 1e-12)
+        factor = LEVEL / max(_level(where, power, surface_samples(corners, _SAMPLES)), 1e-12)
     lights = tuple(
         Light(
             position_m=(float(p[0]), float(p[1]), float(p[2])),
@@ -68,7 +67,7 @@ def scaled_lights(
 def lights_of(
     source: Source,
     light_scale: float | None,
-    triangles: NDArray[np.float64],
+    corners: NDArray[np.float64],
     notes: list[str],
     *,
     turn: NDArray[np.float64],
@@ -78,8 +77,8 @@ def lights_of(
     """Return the lights of a file, or lamps hung where it has none, and add a sentence to the notes.
 
     `light_scale` is a factor of its lights; None: what brings them to `LEVEL`. `turn` [3, 3] takes directions
-    and places of the file to metres with z up, and `shift_m` is added to places; triangles are those of the
-    scene [m].
+    and places of the file to metres with z up, and `shift_m` is added to places; corners are those of the
+    scene's triangles [m], shape [axis, corner, F].
 
     Raises:
         SceneError: There are no lights to scale by `light_scale`.
@@ -90,10 +89,10 @@ def lights_of(
                 f"light_scale = {light_scale:g} scales the lights of the file, and {path} has none: "
                 "leave it out"
             )
-        places, sentence = hang_lamps(triangles)
+        places, sentence = hang_lamps(corners)
         notes.append(f"The file has no lights; {len(places)} are {sentence}.")
-        return scaled_lights(list(places), [(1.0, 0.96, 0.9)] * len(places), triangles, factor=None)[0]
-    low, high = extent(triangles)
+        return scaled_lights(list(places), [(1.0, 0.96, 0.9)] * len(places), corners, factor=None)[0]
+    low, high = extent(corners.T)
     away = 20.0 * float(np.linalg.norm(high - low))
     positions, intensities = [], []
     for lamp in source.lamps:
@@ -105,13 +104,13 @@ def lights_of(
         else:
             positions.append(vector + shift_m)
             intensities.append(lamp.intensity)
-    lights, factor = scaled_lights(positions, intensities, triangles, factor=light_scale)
+    lights, factor = scaled_lights(positions, intensities, corners, factor=light_scale)
     how = "as declared" if light_scale is not None else "so that the median surface is well lit"
     notes.append(f"{len(lights)} lights of the file, their intensities (cd, lx) times {factor:.3g}, {how}.")
     return lights
 
 
-def hang_lamps(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
+def hang_lamps(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], str]:
     """Choose places for lamps: inside, one to each part of the rooms; around the scene if it is no room.
 
     Surfaces are sampled into a grid. A lamp may hang in a cell with a surface 1.2 m or more below and a
@@ -122,15 +121,15 @@ def hang_lamps(triangles: NDArray[np.float64]) -> tuple[NDArray[np.float64], str
     Returns:
         Positions [m], shape [n, 3], and the end of a sentence that says what was done.
     """
-    low, high = extent(triangles)
+    low, high = extent(corners.T)
     size = high - low
     if size[:2].min() < 2.0 or size[2] < 1.8 or size.max() > 500.0:
         return _around(low, high), "placed above and around the scene, which is no room"
     cell = max(0.2, float((np.prod(size + 0.5) / _CELL_MAX) ** (1.0 / 3.0)))
     shape = np.ceil(size / cell).astype(int) + 2
-    count = int(min(2.0 * double_areas(triangles.T).sum() / cell**2 + len(triangles), 1_000_000))
+    count = int(min(2.0 * double_areas(corners).sum() / cell**2 + corners.shape[2], 1_000_000))
     full = np.zeros(shape, dtype=bool)
-    for points in (surface_samples(triangles, count).T, triangles[:, 0].T):
+    for points in (surface_samples(corners, count), corners[:, 0]):
         index = [((x - least) / cell).astype(int) + 1 for x, least in zip(points, low, strict=True)]
         full[tuple(np.clip(i, 0, cells - 1) for i, cells in zip(index, shape, strict=True))] = True
     full[[0, -1]] = full[:, [0, -1]] = True  # nothing hangs outside

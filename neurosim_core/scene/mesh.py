@@ -128,17 +128,16 @@ def load_mesh_scene(config: MeshSceneConfig, *, pictures: bool = True, decode: b
     _check_extent(boxes - origin, path)
 
     positions, faces, keep = _joined(parts, thin, notes, path)
-    triangles = positions.take(faces, axis=0)
+    corners = corner_columns(positions, faces)
     with ThreadPoolExecutor(max_workers=1) as aside:
         shift_m, told = np.array(config.position_m) - origin, list[str]()
         lighting = aside.submit(
-            lights_of, source, config.light_scale, triangles, told, turn=turn, shift_m=shift_m, path=path
+            lights_of, source, config.light_scale, corners, told, turn=turn, shift_m=shift_m, path=path
         )
         arrays = _assembled(parts, positions, faces, keep, source, notes)
         lights = lighting.result()
     notes += told
-    low, high = extent(triangles)
-    size = high - low
+    size = np.ptp(corners, axis=(1, 2))
     if config.unit_m is None and not 0.02 <= size.max() <= 500.0:
         across = f"{size.max():,.0f}" if size.max() > 1.0 else f"{size.max():.3g}"
         notes.insert(0, f"It is {across} m across; if that is wrong, declare unit_m (0.001 for millimetres).")

@@ -10,25 +10,24 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import fcntl
-import gc
 import json
 import mmap
 import os
 import pickle
 import signal
-import subprocess
-import sys
 import tempfile
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
+from typing import IO, TYPE_CHECKING, Any
 
+from neurosim_core.runtime.child import begin_child, end_child, start_child
 from neurosim_core.signals import end_with_parent
 
 if TYPE_CHECKING:
+    from neurosim_core.path_process import PlanningProcess
     from neurosim_core.scene.config import SceneConfig
     from neurosim_core.scene.scene import Scene
 
@@ -51,13 +50,15 @@ class NotReadError(Exception):
 class SceneReader:
     """A process that reads a scene. A context manager, which ends it."""
 
-    def __init__(self, settings: Mapping[str, Any]) -> None:
+    def __init__(self, settings: Mapping[str, Any], *, planner: PlanningProcess | None = None) -> None:
         """Start the process.
 
         Args:
             settings: Unchecked; of them `scene` and `render` count. Relative files are looked up from the
                 working directory.
+            planner: Plans paths in the scene; None: they are planned by who asks for it.
         """
+        self.planner = planner
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed by `__exit__`
         self._places: list[Future[list[tuple[int, int]]]] = [Future() for _ in range(4)]
         """Where the parts of each answer are in the file, and how long they are."""
@@ -67,16 +68,8 @@ class SceneReader:
         with contextlib.suppress(OSError):  # the disk is full: the process finds no settings
             # more than arguments may hold; nothing stays in a buffer
             os.pwrite(self._file.fileno(), json.dumps(read, default=str).encode(), 0)
-        # `-m` would look for modules in the working directory first, where a yaml.py may lie
-        program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", program],
-            stdin=self._file,  # which is to be written, too: its number may be 0 here, and is there
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env={**os.environ, **_KEEP_MEMORY},
-            preexec_fn=end_with_parent(signal.SIGKILL),
-        )
+        # its standard input is to be written, too: its number may be 0 here, and is there
+        self._process = start_child(__name__, stdin=self._file, env=_KEEP_MEMORY)
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
 
@@ -146,20 +139,14 @@ class SceneReader:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._process.kill()
-        self._process.wait()
-        self._listener.join()
-        assert self._process.stdout is not None
-        self._process.stdout.close()
+        self._listener.join()  # it reads to the end
+        end_child(self._process)
         self._file.close()
 
 
 def main() -> None:
-    """Be the process: read settings from file 0, write their scene in their place, and print where it is."""
-    gc.disable()  # it ends soon
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # who asked says that it was interrupted
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: threads cost time
-    with open(0, "r+b") as file, open(os.dup(1), "w") as answers, open(os.devnull, "w") as nowhere:
-        os.dup2(nowhere.fileno(), 1)  # what libraries print is no answer
+    """Be the process: read settings from file 0, write their scene behind them, and say where it is."""
+    with begin_child() as answers, open(0, "r+b") as file:
         settings = json.load(file)
         _read(settings, partial(_write, file=file, answers=answers))
 
@@ -203,8 +190,8 @@ def _read(settings: Mapping[str, Any], write: Callable[[int, object], None]) -> 
     os.waitpid(child, 0)  # it ends with this one
 
 
-def _write(number: int, content: object, *, file: BinaryIO, answers: TextIO) -> None:
-    """Add an answer and the arrays in it to a file, and print where each of them begins and its size."""
+def _write(number: int, content: object, *, file: IO[bytes], answers: IO[bytes]) -> None:
+    """Add an answer and the arrays in it to a file, and say where each of them begins, and its size."""
     buffers: list[pickle.PickleBuffer] = []
     body = pickle.dumps(content, protocol=5, buffer_callback=buffers.append)
     places = []
@@ -215,5 +202,6 @@ def _write(number: int, content: object, *, file: BinaryIO, answers: TextIO) -> 
         places.append((file.tell(), view.nbytes))
         file.write(view)
     file.flush()
-    print(json.dumps((number, places)), file=answers, flush=True)
+    answers.write(json.dumps((number, places)).encode() + b"\n")
+    answers.flush()
     fcntl.lockf(file, fcntl.LOCK_UN)

@@ -19,7 +19,10 @@ if TYPE_CHECKING:  # isort: off
         SamplerContext as SamplerContext,
         StateSensorConfig as StateSensorConfig,
     )
-    from neurosim_core.sensors.event_terms import NoiseTermConfig as NoiseTermConfig, SignalTerm as SignalTerm
+    from neurosim_core.sensors.event_noise_model import (
+        NoiseTermConfig as NoiseTermConfig,
+        SignalTerm as SignalTerm,
+    )
     from neurosim_core.sensors.state_sampler import (
         ErrorConfig as ErrorConfig,
         Errors as Errors,

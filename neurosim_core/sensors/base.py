@@ -396,10 +396,6 @@ class FrameContext:
     """What a frame sensor is made for."""
 
     name: str
-    width: int
-    """[px]."""
-    height: int
-    """[px]."""
     device: str
     in_flight: int
     """The most batches that it has seen and that were not read."""

@@ -36,7 +36,7 @@ Reference: Rebecq, Gehrig, Scaramuzza (2018), ESIM: an Open Event Camera Simulat
 sampling by the maximum displacement between two successive frames).
 """
 
-# No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
+from __future__ import annotations
 
 import math
 from collections.abc import Sequence
@@ -52,26 +52,23 @@ from neurosim_core.render.scene_arrays import SceneArrays
 from neurosim_core.runtime.cuda import Fence, HostCopy, HostInput
 from neurosim_core.scene.bodies import bounding_points, make_body_poses, pose_bodies, upload_motions
 from neurosim_core.sensors.displacement_kernels import (
-    Bodies,
     Pinhole,
-    Poses,
+    Rule,
     carry_row,
+    cast_probes,
     compare_bodies,
+    compare_probes,
     load_poses,
-    rule_kernels,
 )
 
 PROBE_SPACING_PX = 16
 """Distance between the rays that look for what moves [px]: a 256th of the rays of a render."""
 
 _BLOCK = 64
-"""Ticks that are chosen from together; on CUDA all pairs of them are compared."""
-_BLOCK_ON_CPU = 128
-"""There it is the calls that cost, and only those pairs are compared that are asked for."""
+"""Ticks that are chosen from together. On CUDA all pairs of them are compared at once; on a CPU those from a
+render on, when it has been chosen."""
 _SPLIT_MIN = 1 << 14
 """Probes to be cast or compared, times ticks, from which on all cores of a CPU are worth the trouble."""
-_AHEAD_MIN = 2
-"""Least number of ticks that a CPU compares at once with a render."""
 _CHUNK_ON_CUDA = 64
 """Probes that one thread compares there."""
 _SHIFT = (0.7548776662466927, 0.5698402909980532)
@@ -115,47 +112,41 @@ class DisplacementRule:
         self._limit_px = max_displacement_px
         self._rate = rate
         self._mount = (p_BC, q_BC)
-        self._mesh = arrays.mesh_id
         self._device = device = arrays.device
         self._on_cpu = wp.get_device(device).is_cpu
-        self._spacing_px = float(PROBE_SPACING_PX)
-        self._columns = math.ceil(lens.width / PROBE_SPACING_PX) + 2  # one beyond each border
-        self._probe_count = self._columns * (math.ceil(lens.height / PROBE_SPACING_PX) + 2) + 4
-        self._lens = Pinhole()
-        self._lens.fx, self._lens.fy, self._lens.cx, self._lens.cy = lens.intrinsics()
-        self._lens.width, self._lens.height = lens.width, lens.height
-        self._block = _BLOCK_ON_CPU if self._on_cpu else _BLOCK
-        rows = self._block + 1
+        rows = _BLOCK + 1
+        columns = math.ceil(lens.width / PROBE_SPACING_PX) + 2  # one beyond each border
+        self._probe_count = columns * (math.ceil(lens.height / PROBE_SPACING_PX) + 2) + 4
 
         def zeros(shape: Any, dtype: Any) -> Any:
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        self._poses = Poses()
-        self._poses.p_WC, self._poses.p_next_WC = zeros(rows, wp.vec3d), zeros(rows, wp.vec3d)
-        self._poses.q_WC, self._poses.q_next_WC = zeros(rows, wp.quatd), zeros(rows, wp.quatd)
-        self._points = zeros((rows, self._probe_count), wp.vec4d)
-        self._seen = zeros((rows, self._probe_count), wp.vec3d)
-        self._make_bodies(arrays, rows, motions)
-        self._moved = zeros((rows, rows), float)
+        pinhole, rule = Pinhole(), Rule()
+        pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy = lens.intrinsics()
+        pinhole.width, pinhole.height = lens.width, lens.height
+        rule.lens, rule.mesh = pinhole, arrays.mesh_id
+        rule.columns, rule.spacing = columns, float(PROBE_SPACING_PX)
+        rule.p_WC, rule.p_next_WC = zeros(rows, wp.vec3d), zeros(rows, wp.vec3d)
+        rule.q_WC, rule.q_next_WC = zeros(rows, wp.quatd), zeros(rows, wp.quatd)
+        rule.points = zeros((rows, self._probe_count), wp.vec4d)
+        rule.seen = zeros((rows, self._probe_count), wp.vec3d)
+        rule.owner = zeros((rows, self._probe_count), int)
+        self._rule = rule
+        self._add_bodies(arrays, rows, motions)
+        self._moved = rule.moved = zeros((rows, rows), float)
         self._moved_on_host = HostCopy(self._moved)
-        self._slots, self._step_s = zeros(self._block, int), zeros(self._block, wp.float64)
-        self._shifts = zeros(rows, wp.vec2)
-        self._inputs = [HostInput(array) for array in (self._slots, self._step_s, self._shifts)]
+        self._slots, self._step_s = zeros(_BLOCK, int), zeros(_BLOCK, wp.float64)
+        shifts = rule.shifts = zeros(rows, wp.vec2)
+        self._inputs = [HostInput(array) for array in (self._slots, self._step_s, shifts)]
         self._done = Fence(device)
         self._started = False
         self._last_ns = 0
-        self._measured: dict[int, int] = {}
-        self._ahead = _AHEAD_MIN
+        self._measured: set[int] = set()
 
-    def _make_bodies(self, arrays: SceneArrays, rows: int, motions: Any) -> None:
+    def _add_bodies(self, arrays: SceneArrays, rows: int, motions: Any) -> None:
         """Take over the bodies of a scene, if it has any."""
         moving = arrays.bodies
-        self._kernels = rule_kernels(moving is not None)
-        self._bodies = Bodies()
         self._body_count = 0
-        self._owner = wp.zeros(
-            (0, 0) if moving is None else self._points.shape, dtype=int, device=self._device
-        )
         if moving is None:
             return
         self._body_count = len(moving.bodies)
@@ -165,9 +156,9 @@ class DisplacementRule:
         self._body_poses = make_body_poses(rows + 1, self._body_count, self._device)
         self._body_rows: Any = wp.array(np.arange(rows + 1, dtype=np.int32), dtype=int, device=self._device)
         self._stamps = HostInput(wp.zeros((rows + 1, 1), dtype=wp.int64, device=self._device))
-        self._bodies.mesh = moving.mesh
-        self._bodies.corners = wp.array(bounding_points(moving.bodies), dtype=wp.vec3d, device=self._device)
-        self._bodies.p_WO, self._bodies.q_WO = self._body_poses.p_WO, self._body_poses.q_WO
+        self._rule.body_mesh = moving.mesh
+        self._rule.corners = wp.array(bounding_points(moving.bodies), dtype=wp.vec3d, device=self._device)
+        self._rule.p_WO, self._rule.q_WO = self._body_poses.p_WO, self._body_poses.q_WO
 
     def begin_again(self) -> None:
         """Have the next tick rendered, whatever has moved."""
@@ -186,8 +177,8 @@ class DisplacementRule:
         """
         self.coarse_count = 0
         chosen: list[int] = []
-        for begin in range(0, len(slots), self._block):
-            block = slice(begin, begin + self._block)
+        for begin in range(0, len(slots), _BLOCK):
+            block = slice(begin, begin + _BLOCK)
             self._load(states, slots[block], stamps_ns[block])
             found = [begin + tick for tick in self._choose(forced[block])]
             self._last_ns = stamps_ns[found[-1]] if found else self._last_ns
@@ -204,18 +195,12 @@ class DisplacementRule:
         for tick, must in enumerate(forced, start=1):
             if must or not self._started or self._moved_px(last, tick, count) > self._limit_px:
                 chosen.append(tick - 1)
-                self._ahead = max(tick - last, _AHEAD_MIN)
                 last = tick
                 self._started = True
         self.coarse_count += sum(self._moved_px(t + 1, t + 1, count) > self._limit_px for t in chosen)
         if last > 0:
-            wp.launch(
-                carry_row,
-                dim=self._probe_count,
-                inputs=[last],
-                outputs=[self._poses, self._points, self._seen, self._owner],
-                device=self._device,
-            )
+            inputs = [last, self._rule]
+            wp.launch(carry_row, dim=self._probe_count, inputs=inputs, device=self._device)
         return chosen
 
     def _load(self, states: Any, slots: Sequence[int], stamps_ns: Sequence[int]) -> None:
@@ -229,13 +214,8 @@ class DisplacementRule:
         of_shifts[1 : count + 1] = np.outer(np.arange(first, first + count), _SHIFT) % 1.0
         for given in self._inputs:
             given.upload()
-        wp.launch(
-            load_poses,
-            dim=count,
-            inputs=[*self._mount, states, self._slots, self._step_s],
-            outputs=[self._poses],
-            device=self._device,
-        )
+        inputs = [*self._mount, states, self._slots, self._step_s, self._rule]
+        wp.launch(load_poses, dim=count, inputs=inputs, device=self._device)
         if self._body_count > 0:
             self._stamps.rows[: count + 2, 0] = [self._last_ns, *stamps_ns, ends_ns[-1]]
             self._stamps.upload()
@@ -243,77 +223,38 @@ class DisplacementRule:
                 self._motions, self._stamps.array, self._body_rows, count=count + 2, poses=self._body_poses
             )
         self._moved.zero_()
-        self._measured = {}
+        self._measured = set()
 
     def _moved_px(self, row: int, tick: int, count: int) -> float:
-        """Return the largest displacement from a render in a row to the tick after another row [px].
-
-        A CPU compares a few ticks at once: about as many as passed before the last render, then ever more.
-        """
-        if self._on_cpu and tick >= self._measured.get(row, -1):
-            begin = self._measured.get(row, row)
-            end = min(tick + self._ahead, count + 1)
-            fresh = row not in self._measured and row > 0
-            self._measure(row, int(fresh), row, 1, begin, end - begin)
-            self._measured[row] = end
-            self._ahead = min(2 * self._ahead, self._block)
+        """Return the largest displacement from a render in a row to the tick after another row [px]."""
+        if self._on_cpu and row not in self._measured:
+            self._measure(row, int(row > 0), row, 1, row, count + 1 - row)
+            self._measured.add(row)
         return float(self._moved_on_host.view(row, 1)[0, tick])
 
     def _measure(
         self, cast_row: int, cast_count: int, row: int, row_count: int, tick: int, tick_count: int
     ) -> None:
         """Cast the probes of some rows, compare those of some rows with some ticks, and wait."""
-        if cast_count > 0:
-            launch_split(
-                self._kernels.cast,
-                dim=cast_count * self._probe_count,
-                inputs=[
-                    self._mesh,
-                    self._lens,
-                    self._columns,
-                    self._spacing_px,
-                    cast_row,
-                    self._poses,
-                    self._bodies,
-                    self._shifts,
-                ],
-                outputs=[self._points, self._seen, self._owner],
-                device=self._device,
-                thread_count=self._threads(cast_count),
-            )
+        pairs = row_count * tick_count
         chunk = self._probe_count if self._on_cpu else _CHUNK_ON_CUDA
-        launch_split(
-            self._kernels.compare,
-            dim=row_count * tick_count * -(-self._probe_count // chunk),
-            inputs=[
-                self._lens,
-                row,
-                tick,
-                tick_count,
-                chunk,
-                self._poses,
-                self._bodies,
-                self._points,
-                self._seen,
-                self._owner,
-            ],
-            outputs=[self._moved],
-            device=self._device,
-            thread_count=self._threads(row_count * tick_count),
-        )
+        compared = [row, tick, tick_count]
+        if cast_count > 0:
+            self._launch(cast_probes, cast_count, self._probe_count, [cast_row])
+        self._launch(compare_probes, pairs, -(-self._probe_count // chunk), [*compared, chunk])
         if self._body_count > 0:
-            launch_split(
-                compare_bodies,
-                dim=row_count * tick_count * self._body_count,
-                inputs=[self._lens, row, tick, tick_count, self._poses, self._bodies],
-                outputs=[self._moved],
-                device=self._device,
-                thread_count=self._threads(row_count * tick_count),
-            )
+            self._launch(compare_bodies, pairs, self._body_count, compared)
         self._moved_on_host.fetch(row, row_count)
         self._done.set()
         self._done.wait()
 
-    def _threads(self, times: int) -> int | None:
-        """Return how many threads of a CPU look at all probes so many times; None: all cores."""
-        return None if times * self._probe_count >= _SPLIT_MIN else 1
+    def _launch(self, kernel: Any, times: int, thread_count: int, inputs: Sequence[int]) -> None:
+        """Launch so many threads so many times; on a CPU all cores take them if they look at many probes."""
+        launch_split(
+            kernel,
+            dim=times * thread_count,
+            inputs=inputs,
+            outputs=[self._rule],
+            device=self._device,
+            thread_count=None if times * self._probe_count >= _SPLIT_MIN else 1,
+        )

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.packets import EventArrays
-from neurosim_core.runtime.cuda import HostInput, RecordedLaunch
+from neurosim_core.runtime.cuda import HostCopy, HostInput, RecordedLaunch
 from neurosim_core.sensors import event_kernels
 from neurosim_core.sensors.event_config import EventCameraConfig
-from neurosim_core.sensors.event_cut import COLUMN_OFFSETS, COLUMN_TYPES, EVENT_BYTES
 from neurosim_core.sensors.event_input import as_frames, invalid_message
+from neurosim_core.sensors.event_kernels import COLUMN_OFFSETS, COLUMN_TYPES, EVENT_BYTES
+from neurosim_core.sensors.event_scan import ALL
 from neurosim_core.sensors.event_worlds import WorldEventCamera
 from neurosim_core.warp_start import start_warp
 
@@ -72,7 +73,7 @@ class FrameEvents:
         if self._columns is None:
             if self._number != self._batch.frame_number:
                 raise RuntimeError(f"events of {self.stamp_ns} ns were not read before the next frame")
-            self._columns = self._batch.take_apart(self)
+            self._columns = self._batch.decode(self)
         return self._columns
 
     def numpy(self, camera: int = 0) -> EventArrays:
@@ -131,20 +132,16 @@ class EventCameraBatch:
             sensor=sensor,
             seeds=self._seeds,
             ordered=False,
-            takes_apart=False,
+            decodes=False,
         )
         self.terms = self._cameras.terms
         self._all = wp.ones(count, dtype=wp.int32, device=self.device)
-        counters = wp.zeros((count, 3), dtype=wp.int64, device="cpu", pinned=self.device.is_cuda)
-        self._counters = counters.numpy()
-        self._counters_out: Any = wp.array(
-            ptr=counters.ptr, dtype=wp.int64, shape=(count, 3), device=self.device
-        )
-        self._counters_on_host = counters
+        self._counters = HostCopy(wp.zeros((count, 3), dtype=wp.int64, device=self.device))
+        self._counters_out = self._counters.mapped()
         self._frames_seen = self._cameras.stack.__ctype__().log_radiance
         """Of the recorded launches' parameters: where they read frames."""
         self._begin = RecordedLaunch(event_kernels.begin_frame, self.device)
-        self._hand_over = RecordedLaunch(event_kernels.hand_over_counters, self.device)
+        self._move_counters = RecordedLaunch(event_kernels.move_counters, self.device)
         self._decode = RecordedLaunch(event_kernels.decode, self.device)
         self._offsets = HostInput(wp.zeros(count + 1, dtype=wp.int32, device=self.device))
         self._scans = [self._cameras.record_scan(parity) for parity in (0, 1)] if self.device.is_cuda else []
@@ -207,7 +204,7 @@ class EventCameraBatch:
         if self._scans:
             self._scans[self._parity].launch()
         else:
-            self._cameras.take_frames(1, event_kernels.ALL, self._parity)
+            self._cameras.take_frames(1, ALL, self._parity)
         counts = self._read_counters()
         dropped_count = 0
         if max(counts) > self._capacity or max(counts) > self._event_count_max:
@@ -221,9 +218,9 @@ class EventCameraBatch:
     @property
     def span_max_ns(self) -> int:
         """Longest time between two frames [ns]."""
-        return NS_PER_US << (62 - self._cameras.time_shift)
+        return NS_PER_US << (62 - self._cameras.layout.time_shift)
 
-    def take_apart(self, events: FrameEvents) -> Sequence[Any]:
+    def decode(self, events: FrameEvents) -> Sequence[Any]:
         """Return time, column, row and polarity of the events of the last frame, in arrays of their own."""
         room = len(events)
         spaced = room + room % 2  # columns in a block begin where they may
@@ -239,10 +236,16 @@ class EventCameraBatch:
             return columns
         self._offsets.rows[:] = events.offsets
         self._offsets.upload()
-        shifts = (self._cameras.row_shift, self._cameras.time_shift)
         lanes = max(1, _LANES // self._shape[0]) if self.device.is_cuda else 1
         origin_us = events.start_ns // NS_PER_US - self._origin_us
-        arguments = (*shifts, lanes, origin_us, self._cameras.stack, self._offsets.array, *columns)
+        arguments = (
+            self._cameras.layout,
+            lanes,
+            origin_us,
+            self._cameras.stack,
+            self._offsets.array,
+            *columns,
+        )
         self._decode.launch((self._shape[0], lanes), arguments)
         return columns
 
@@ -258,9 +261,9 @@ class EventCameraBatch:
 
     def _read_counters(self) -> list[int]:
         """Wait for a scan and return how many events each camera has."""
-        self._hand_over.launch(self._shape[0], [self._cameras.stack.counters, self._counters_out])
+        self._move_counters.launch(self._shape[0], [self._cameras.stack.counters, self._counters_out])
         wp.synchronize_stream(self.device)
-        rows = self._counters.tolist()
+        rows = self._counters.view(0, self._shape[0]).tolist()
         if any(row[1] for row in rows):
             camera = next(index for index, row in enumerate(rows) if row[1])
             self._stamp_ns = None

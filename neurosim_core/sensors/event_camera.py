@@ -22,7 +22,7 @@ from neurosim_core.sensors.base import (
 )
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_labels import EventLabel, EventLabels
-from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, terms_of
+from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS
 from neurosim_core.sensors.event_worlds import WorldEventCamera
 from neurosim_core.sensors.events import EventCamera
 
@@ -158,7 +158,7 @@ class EventChannel:
     """
 
     def __init__(self, config: EventSensorConfig, context: FrameContext) -> None:
-        terms = terms_of(config.pixel)
+        terms = config.pixel.terms()
         has_cause = "cause" in config.labels and bool(terms)  # of ideal pixels it is the signal
         self._labels = (
             EventLabels(config.labels, config.classes, context, has_cause=has_cause)
@@ -167,8 +167,8 @@ class EventChannel:
         )
         self.camera = EventCamera(
             config.pixel,
-            width=context.width,
-            height=context.height,
+            width=context.lens.width,
+            height=context.lens.height,
             device=context.device,
             sensor=context.name,
             seed=context.seed,

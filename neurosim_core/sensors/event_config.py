@@ -13,9 +13,9 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
 from neurosim_core.registry import register
-from neurosim_core.sensors.event_terms import NoiseTermConfig, parse_terms
+from neurosim_core.sensors.event_noise_model import TERMS, NoiseTermConfig, parse_terms
 from neurosim_core.settings import Settings, fill_from_preset
-from neurosim_core.tables import read_table
+from neurosim_core.settings_file import read_table
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Rate = Annotated[float, Field(ge=0.0, le=1e6)]
@@ -323,6 +323,15 @@ class EventCameraConfig(Settings):
     """Most events between two frames. When there are more, the rows from the top are kept as long as they
     fit; the events of the others are lost, and counted in `Events.dropped_count`. The buffer grows up to this
     size times the frames of a batch as needed, 8 bytes per event; sorting takes about 40 bytes per event."""
+
+    def terms(self) -> tuple[str, ...]:
+        """Return what departs from ideal pixels: some of `event_noise_model.TERMS`, and terms of others."""
+        groups = [getattr(self, name) for name in type(self).model_fields]
+        terms = [each for each in (*groups, *self.noise) if isinstance(each, NoiseTermConfig)]
+        present = {name for term in terms for name in term.terms()}
+        if self.refractory_s > 0.0:
+            present.add("refractory")
+        return (*(term for term in TERMS if term in present), *sorted(present - set(TERMS)))
 
     @model_validator(mode="before")
     @classmethod

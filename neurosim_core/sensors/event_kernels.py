@@ -1,67 +1,35 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,empty-body,assignment"
-# mypy: disable-error-code="no-untyped-def,valid-type"
-"""Kernels of event cameras in one world or many: the scan of all pixels, and keys in order.
+"""Kernels around the scan of event cameras: how a step begins, its limits, keys in order, windows, columns.
 
-The law of a pixel is a function that gets the arrays of one world: that of ideal pixels is in `event_scan`,
-that of others in `event_noise_scan`. A kernel for single frames on CUDA is in `event_frame_scan`.
-
-Every world has keys and counters of its own, and no block of threads takes pixels of two, so a block finds
-room for its events in its world with one atomic operation. Nothing here depends on other worlds.
-
-Keys are sorted within each world, by one block each: how many there are is known only to the device, and a
-sort of all worlds together would have to be launched over all the room there is.
+Of many worlds, keys are sorted within each world, by one block each: how many there are is known only to the
+device, and a sort of all worlds together would have to be launched over all the room there is.
 """
-
-import functools
-from typing import Any
 
 import warp as wp
 
 from neurosim_core.native_code import read_native
-from neurosim_core.sensors.event_cut import take_apart
-from neurosim_core.sensors.event_levels import quiet_range
-from neurosim_core.sensors.event_noise_model import Memory, PixelModel
-from neurosim_core.sensors.event_noise_scan import make_pixel_scan
-from neurosim_core.sensors.event_scan import (
-    BLOCK_SIZE,
-    CLOSE,
-    LIMIT,
-    OPEN,
-    scan_pixel,
-    write_key,
-)
+from neurosim_core.sensors.event_levels import COLUMN_SHIFT, KeyLayout
+from neurosim_core.sensors.event_scan import LIMIT, PixelState, Stack, note_invalid
 
 wp.set_module_options({"enable_backward": False})
 
-ALL = wp.constant(0)
-COUNT = wp.constant(1)
-AGAIN = wp.constant(2)
-"""What a scan is for: all worlds; those with too many events, to count these by row; the same with fewer
-rows."""
+COLUMN_TYPES = (wp.int64, wp.uint16, wp.uint16, wp.uint8)
+"""Types of the times, columns, rows and polarities of events."""
+COLUMN_OFFSETS = (0, 8, 10, 12)
+"""Where each of them begins in a block of memory with room for one event."""
+EVENT_BYTES = 13
 
-TILE_SIZE = wp.constant(256)
-"""Pixels that a thread of `screen` takes."""
+# places in the header of a cut
+_KEY_COUNT = wp.constant(0)
+_ROOM = wp.constant(1)
+_ORIGIN_US = wp.constant(2)
+
 SECTION = wp.constant(64)
 """Worlds whose events are added up first: of N worlds no thread reads more than N / 64 + 64 counts."""
 
 _US = wp.constant(wp.int64(1000))
-
-
-@wp.struct
-class Stack:
-    """What the pixels of one camera see in a step, and what comes of it. Shapes begin with [world]."""
-
-    log_radiance: wp.array3d[wp.float32]  # [world, frame, pixel]
-    stamps: wp.array2d[wp.int64]  # Of the state and of each frame, from the origin [ns], [world, frame + 1]
-    origin_us: wp.array[wp.int64]  # Origin of the keys' time since the reset of the world [us]
-    since_reset_ns: wp.array[wp.int64]
-    """The same from the reset of the pixels on, which noise counts from [ns]."""
-    row_limit: wp.array2d[wp.int32]  # Rows whose events are kept, [world, frame]
-    overflow: wp.array[wp.int32]  # 1: the world has more events than fit
-    table: wp.array3d[wp.int32]  # Events of the worlds that have too many, [world, frame, row]; zeros before
-    keys: wp.array2d[wp.int64]  # [world, capacity]
-    counters: wp.array2d[wp.int64]  # As in `event_scan.scan_pixel`, [world, 3]
-    dropped: wp.array[wp.int32]  # Events that were lost in the step
+_NOTHING = wp.constant(wp.int64((1 << 63) - 1))
+"""Key that sorts behind all others."""
 
 
 @wp.kernel
@@ -106,7 +74,7 @@ def begin_frame(
 
 
 @wp.kernel
-def hand_over_counters(
+def move_counters(
     # In/out:
     counters: wp.array2d[wp.int64],
     # Out:
@@ -119,202 +87,13 @@ def hand_over_counters(
         counters[world, counter] = wp.int64(0)
 
 
-@wp.func_native(read_native(__file__, "count_lead"))
-def _count_lead(
-    begin: wp.int32,
-    end: wp.int32,
-    log_radiance: wp.array2d[wp.float32],
-    frame_count: wp.int32,
-    low_32: wp.array[wp.float32],
-    high_32: wp.array[wp.float32],
-    lead_out: wp.array[wp.int32],
-) -> None:
-    """Count for at most 256 pixels the frames before the first that leaves (low, high)."""
-    ...
-
-
-@wp.kernel
-def screen(
-    # Model:
-    thresholds: wp.array[wp.vec2d],
-    # In:
-    first_world: wp.int32,
-    first_pixel: wp.int32,
-    end_pixel: wp.int32,
-    frame_count: wp.int32,
-    stack: Stack,
-    base: wp.array2d[wp.float32],
-    crossed: wp.array2d[wp.vec2i],
-    # Out:
-    low_out: wp.array2d[wp.float32],
-    high_out: wp.array2d[wp.float32],
-    lead_out: wp.array2d[wp.int32],
-) -> None:
-    """Count the frames of each pixel before the first that may fire; threads are [world, tile].
-
-    This is what makes the scan fast on a CPU: a pixel's own samples lie far apart in memory. It changes no
-    event. The quiet range of each pixel is left in `low_out` and `high_out`.
-    """
-    index, tile = wp.tid()
-    world = first_world + index
-    begin = first_pixel + tile * TILE_SIZE
-    end = wp.min(begin + TILE_SIZE, end_pixel)
-    on = thresholds[world][0]
-    off = thresholds[world][1]
-    for pixel in range(begin, end):
-        before = crossed[world, pixel]
-        quiet = quiet_range(wp.float64(base[world, pixel]), before[0], before[1], on, off)
-        low_out[world, pixel] = quiet[0]
-        high_out[world, pixel] = quiet[1]
-    _count_lead(
-        begin,
-        end,
-        stack.log_radiance[world],
-        frame_count,
-        low_out[world],
-        high_out[world],
-        lead_out[world],
-    )
-
-
-@wp.kernel(launch_bounds=(BLOCK_SIZE, 4))  # blocks of a multiprocessor: fastest on an H200
-def scan(
-    # Model:
-    thresholds: wp.array[wp.vec2d],
-    width: wp.int32,
-    row_shift: wp.int32,
-    time_shift: wp.int32,
-    # In:
-    first_world: wp.int32,
-    first_pixel: wp.int32,
-    end_pixel: wp.int32,
-    frame_count: wp.int32,
-    part: wp.int32,
-    lead: wp.array2d[wp.int32],
-    base: wp.array2d[wp.float32],
-    last: wp.array2d[wp.float32],
-    crossed: wp.array2d[wp.vec2i],
-    # In/out:
-    stack: Stack,
-    # Out:
-    last_out: wp.array2d[wp.float32],
-    crossed_out: wp.array2d[wp.vec2i],
-) -> None:
-    """Take ideal pixels over the frames of a step; threads are [world, pixel], whole blocks to a world.
-
-    Threads begin at a world and a pixel; those at or past `end_pixel` (they fill the last CUDA block) have no
-    pixel. `part` is ALL, COUNT or AGAIN; the others are those of `scan_pixel`.
-    """
-    index, thread = wp.tid()
-    world = first_world + index
-    if part != ALL and stack.overflow[world] == 0:
-        return
-    scan_pixel(
-        thresholds[world][0],
-        thresholds[world][1],
-        width,
-        row_shift,
-        time_shift,
-        first_pixel + thread,
-        end_pixel,
-        thread % BLOCK_SIZE,
-        stack.log_radiance[world],
-        stack.stamps[world],
-        frame_count,
-        lead[world],
-        stack.row_limit[world],
-        base[world],
-        last[world],
-        crossed[world],
-        part == COUNT,
-        last_out[world],
-        crossed_out[world],
-        stack.keys[world],
-        stack.counters[world],
-        stack.table[world],
-    )
-
-
-@functools.cache
-def make_noisy_scan(terms: frozenset[str]) -> Any:
-    """Return the kernel that does the same for pixels with the given terms (`event_noise_model.terms_of`).
-
-    In place of thresholds it takes a `PixelModel` of each world, and a `Memory` of each before and after.
-    """
-    scan_noisy = make_pixel_scan(terms)
-
-    @wp.kernel(
-        module=wp.get_module(f"{__name__}.{'_'.join(sorted(terms)) or 'ideal'}"), enable_backward=False
-    )
-    def scan(
-        # Model:
-        models: wp.array[PixelModel],
-        width: wp.int32,
-        row_shift: wp.int32,
-        time_shift: wp.int32,
-        # In:
-        first_world: wp.int32,
-        first_pixel: wp.int32,
-        end_pixel: wp.int32,
-        frame_count: wp.int32,
-        part: wp.int32,
-        base: wp.array2d[wp.float32],
-        last: wp.array2d[wp.float32],
-        crossed: wp.array2d[wp.vec2i],
-        before: wp.array[Memory],
-        # In/out:
-        stack: Stack,
-        # Out:
-        last_out: wp.array2d[wp.float32],
-        crossed_out: wp.array2d[wp.vec2i],
-        after: wp.array[Memory],
-    ):
-        index, thread = wp.tid()
-        world = first_world + index
-        pixel = first_pixel + thread
-        if part != ALL and stack.overflow[world] == 0:
-            return
-        keys = stack.keys[world]
-        counters = stack.counters[world]
-        write_key(OPEN, wp.int64(0), keys, counters)
-        if pixel < end_pixel:
-            scan_noisy(
-                models[world],
-                width,
-                row_shift,
-                time_shift,
-                pixel,
-                stack.log_radiance[world],
-                stack.stamps[world],
-                stack.since_reset_ns[world],
-                frame_count,
-                stack.row_limit[world],
-                base[world],
-                last[world],
-                crossed[world],
-                before[world],
-                part == COUNT,
-                last_out[world],
-                crossed_out[world],
-                after[world],
-                keys,
-                counters,
-                stack.table[world],
-            )
-        write_key(CLOSE, wp.int64(0), keys, counters)
-
-    return scan
-
-
 @wp.kernel
 def begin_pixels(
     # In:
     mask: wp.array[wp.int32],
     log_radiance: wp.array3d[wp.float32],
     # Out:
-    base_out: wp.array2d[wp.float32],
-    last_out: wp.array2d[wp.float32],
-    crossed_out: wp.array2d[wp.vec2i],
+    state_out: PixelState,
     # In/out:
     counters: wp.array2d[wp.int64],
 ) -> None:
@@ -328,11 +107,10 @@ def begin_pixels(
         value = log_radiance[world, 0, pixel]
         if not wp.abs(value) <= LIMIT:
             value = wp.float32(0.0)
-            wp.atomic_add(counters, world, 1, wp.int64(1))
-            wp.atomic_max(counters, world, 2, wp.int64(base_out.shape[1]) - wp.int64(pixel))
-        base_out[world, pixel] = value
-        last_out[world, pixel] = value
-        crossed_out[world, pixel] = wp.vec2i(0, 0)
+            note_invalid(1, 0, 1, pixel, state_out.base.shape[1], counters[world])
+        state_out.base[world, pixel] = value
+        state_out.last[world, pixel] = value
+        state_out.crossed[world, pixel] = wp.vec2i(0, 0)
 
 
 @wp.kernel
@@ -438,11 +216,34 @@ def sort_keys(
     _sort_block(keys[world], wp.int32(counters[world, 0]))
 
 
+@wp.struct
+class Event:
+    """What a key says."""
+
+    time_us: wp.int64  # From the keys' time origin
+    x: wp.uint16
+    y: wp.uint16
+    polarity: wp.uint8
+
+
+@wp.func
+def decode_key(key: wp.int64, layout: KeyLayout) -> Event:
+    """Return what a key says."""
+    one = wp.int64(1)
+    row_mask = (one << wp.int64(layout.time_shift - 1 - layout.row_shift)) - one
+    column_mask = (one << (wp.int64(layout.row_shift) - COLUMN_SHIFT)) - one
+    found = Event()
+    found.time_us = key >> wp.int64(layout.time_shift)
+    found.x = wp.uint16((key >> COLUMN_SHIFT) & column_mask)
+    found.y = wp.uint16((key >> wp.int64(layout.row_shift)) & row_mask)
+    found.polarity = wp.uint8((key >> wp.int64(10)) & one)
+    return found
+
+
 @wp.kernel
 def decode(
     # Model:
-    row_shift: wp.int32,
-    time_shift: wp.int32,
+    layout: KeyLayout,
     lane_count: wp.int32,
     # In:
     origin_us: wp.int64,
@@ -462,8 +263,138 @@ def decode(
     first = offsets[world]
     for index in range(lane, offsets[world + 1] - first, lane_count):
         event = first + index
-        found = take_apart(stack.keys[world, index], row_shift, time_shift)
+        found = decode_key(stack.keys[world, index], layout)
         t_out[event] = origin_us + stack.origin_us[world] + found.time_us
         x_out[event] = found.x
         y_out[event] = found.y
         polarity_out[event] = found.polarity
+
+
+@wp.func
+def mark(key: wp.int64, stamps: wp.array[wp.int64], stamp_count: wp.int32, time_shift: wp.int32) -> wp.int64:
+    """Return a key with `late` set if it comes after a stamp within its microsecond; see `prepare`."""
+    time_us = key >> wp.int64(time_shift)
+    low = wp.int32(0)
+    high = stamp_count
+    while low < high:
+        middle = (low + high) // 2
+        if stamps[middle] // _US < time_us:
+            low = middle + 1
+        else:
+            high = middle
+    if low < stamp_count:
+        end_ns = stamps[low]
+        sub_ns = key & wp.int64(1023)
+        if end_ns // _US == time_us and sub_ns > end_ns - time_us * _US:
+            return key | (wp.int64(1) << wp.int64(time_shift - 1))
+    return key
+
+
+@wp.kernel
+def prepare(
+    # In:
+    header: wp.array[wp.int64],
+    bounds: wp.array[wp.int64],
+    window_count: wp.int32,
+    time_shift: wp.int32,
+    # In/out:
+    keys: wp.array[wp.int64],
+) -> None:
+    """Set `late` on keys that come after the end of a window within its microsecond; threads are the room.
+
+    Keys beyond the count get to sort behind all others. `bounds` are the ends of windows from the keys' time
+    origin [ns], at least 1 us apart; the rest of `header` is for `decode_windows`.
+    """
+    event = wp.tid()
+    if wp.int64(event) < header[_KEY_COUNT]:
+        keys[event] = mark(keys[event], bounds, window_count, time_shift)
+    else:
+        keys[event] = _NOTHING
+
+
+@wp.func
+def move_origin(key: wp.int64, step_us: wp.int64, time_shift: wp.int32) -> wp.int64:
+    """Return a key with a time origin that is later, and without `late`."""
+    return (key & ~(wp.int64(1) << wp.int64(time_shift - 1))) - (step_us << wp.int64(time_shift))
+
+
+@wp.kernel
+def carry_over(
+    # In:
+    keys: wp.array[wp.int64],
+    first: wp.int32,
+    count: wp.int32,
+    origin_step_us: wp.int64,
+    time_shift: wp.int32,
+    # Out:
+    keys_out: wp.array[wp.int64],
+    first_out: wp.int32,
+) -> None:
+    """Copy keys, from and to a position, with a time origin that is later, and clear `late`."""
+    event = wp.tid()
+    if event < count:
+        keys_out[first_out + event] = move_origin(keys[first + event], origin_step_us, time_shift)
+
+
+@wp.func
+def _bound_of(end_ns: wp.int64, time_shift: wp.int32) -> wp.int64:
+    """Return the least key that may come after a window which ends then."""
+    return ((end_ns // _US) << wp.int64(time_shift)) | (wp.int64(1) << wp.int64(time_shift - 1))
+
+
+@wp.func
+def _first_window_after(
+    key: wp.int64, bounds: wp.array[wp.int64], count: wp.int32, shift: wp.int32
+) -> wp.int32:
+    """Return the first of the windows that may hold a key, or come after it."""
+    low = wp.int32(0)
+    high = count
+    while low < high:
+        middle = (low + high) // 2
+        if key < _bound_of(bounds[middle], shift):
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@wp.kernel
+def decode_windows(
+    # In:
+    header: wp.array[wp.int64],
+    bounds: wp.array[wp.int64],
+    window_count: wp.int32,
+    keys: wp.array[wp.int64],
+    layout: KeyLayout,
+    # Out:
+    t_out: wp.array[wp.int64],
+    x_out: wp.array[wp.uint16],
+    y_out: wp.array[wp.uint16],
+    polarity_out: wp.array[wp.uint8],
+    end_out: wp.array[wp.int32],
+) -> None:
+    """Write what sorted keys that `prepare` has seen say, and the index of the first one after each window.
+
+    Threads are the room. `header` holds how many keys there are, at least one; the room of columns; the
+    origin of their time [us]. With a room, an even number, the columns are one block of memory, given as the
+    types that are in it, one after the other; with 0 each is an array of its own.
+    """
+    event = wp.tid()
+    count = wp.int32(header[_KEY_COUNT])
+    if event < count:
+        room = wp.int32(header[_ROOM])
+        key = keys[event]
+        found = decode_key(key, layout)
+        t_out[event] = header[_ORIGIN_US] + found.time_us
+        x_out[4 * room + event] = found.x
+        y_out[5 * room + event] = found.y
+        polarity_out[12 * room + event] = found.polarity
+        first = wp.int32(0)  # of the windows that end at this event
+        if event > 0:
+            first = _first_window_after(keys[event - 1], bounds, window_count, layout.time_shift)
+        end = _first_window_after(key, bounds, window_count, layout.time_shift)
+        for window in range(first, end):
+            end_out[window] = event
+        if event == count - 1:
+            for window in range(end, window_count):
+                end_out[window] = count

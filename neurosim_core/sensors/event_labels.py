@@ -240,7 +240,16 @@ class EventLabels:
             wp.copy(self._flown, self._history.count)
 
     def launch(self, count: int, t: Any, x: Any, y: Any, *, first_x: int = 0, first_y: int = 0) -> None:
-        """Launch the search for the truth of events, and its copy to the host; see `Labeller.launch`."""
+        """Launch the search for the truth of events, and its copy to the host.
+
+        Args:
+            count: How many events there are.
+            t: Their times [us], int64, shape [>= count].
+            x: Their columns [px], uint16, from `first_x` on.
+            y: Their rows [px], uint16, from `first_y` on.
+            first_x: Where the columns begin in `x`.
+            first_y: Where the rows begin in `y`.
+        """
         self._count, self._taken = count, 0
         if not self._geometry or count == 0:
             return

@@ -2,9 +2,9 @@
 """Levels of log radiance that a pixel compares its samples with, and the 64-bit keys of crossings.
 
 A pixel holds the log radiance it was reset to (`base`), and how many levels it crossed upwards and downwards
-since. The reference level is a function of these counts,
+since. The reference level is a function of these counts, with `on` and `off` the thresholds,
 
-    L_ref = base + up * threshold_on - down * threshold_off     (float64)
+    L_ref = base + up * on - down * off     (float64)
 
 so nothing accumulates: after any number of events it has the rounding of one evaluation. Where both sums
 agree within that rounding, the level is the base itself.
@@ -16,8 +16,8 @@ Crossing times are rounded to 2^-10 ns, then written as a key that sorts in the 
     time [us] | late | row | col | polarity | nanoseconds after the microsecond, rounded up (0 .. 1000)
 
 Rounded down to the microsecond, a crossing gets its time; rounded up to the nanosecond, it is compared
-exactly with the stamps of windows. `event_cut.prepare` sets `late` on events that share the microsecond of
-a window's end but come after it, so that windows are contiguous in the sorted keys.
+exactly with the stamps of windows. `event_kernels.prepare` sets `late` on events that share the microsecond
+of a window's end but come after it, so that windows are contiguous in the sorted keys.
 """
 
 import warp as wp
@@ -40,6 +40,45 @@ _TICKS_PER_NS = wp.constant(wp.float64(1024.0))
 _US = wp.constant(wp.int64(1000))
 
 
+@wp.struct
+class KeyLayout:
+    """How many bits of a key are below what it says of a pixel."""
+
+    width: wp.int32  # Of the sensor [px]
+    column_shift: wp.int32  # Below the column; what is below it as well is its cause (`event_noise_model`)
+    row_shift: wp.int32
+    time_shift: wp.int32  # Below the microseconds
+
+
+def make_layout(width: int, height: int, *, cause_bits: int = 0) -> KeyLayout:
+    """Return the layout of the keys of a sensor."""
+    layout = KeyLayout()
+    layout.width = width
+    layout.column_shift = SUB_BITS + cause_bits
+    layout.row_shift = layout.column_shift + (width - 1).bit_length()
+    layout.time_shift = layout.row_shift + (height - 1).bit_length() + 1
+    return layout
+
+
+@wp.struct
+class Levels:
+    """What the levels of a pixel are counted from, and how far they are apart; see above."""
+
+    base: wp.float64
+    on: wp.float64
+    off: wp.float64
+
+
+@wp.func
+def levels_from(base: wp.float64, on: wp.float64, off: wp.float64) -> Levels:
+    """Return the levels of a pixel, from the log radiance of the reset and its thresholds."""
+    levels = Levels()
+    levels.base = base
+    levels.on = on
+    levels.off = off
+    return levels
+
+
 @wp.func_native(read_native(__file__, "product"))
 def _product(a: wp.float64, b: wp.float64) -> wp.float64:
     """Return a product, on CUDA not joined with a sum: a level has the same bits wherever it is asked."""
@@ -47,16 +86,14 @@ def _product(a: wp.float64, b: wp.float64) -> wp.float64:
 
 
 @wp.func
-def level_at(
-    base: wp.float64, up: wp.int32, down: wp.int32, threshold_on: wp.float64, threshold_off: wp.float64
-) -> wp.float64:
-    """Return the level after so many crossings, from the log radiance of the reset."""
-    rise = _product(wp.float64(up), threshold_on)
-    fall = _product(wp.float64(down), threshold_off)
+def level_at(levels: Levels, up: wp.int32, down: wp.int32) -> wp.float64:
+    """Return the level after so many crossings upwards and downwards."""
+    rise = _product(wp.float64(up), levels.on)
+    fall = _product(wp.float64(down), levels.off)
     step = rise - fall
     if wp.abs(step) <= _ROUNDING * (rise + fall):
-        return base
-    return base + step
+        return levels.base
+    return levels.base + step
 
 
 @wp.func
@@ -66,41 +103,30 @@ def _half_ulp(base: wp.float32) -> wp.float64:
 
 
 @wp.func
-def _bound(level: wp.float64, base: wp.float64, half_ulp: wp.float64, direction: wp.float64) -> wp.float32:
+def _bound(level: wp.float64, base: wp.float64, direction: wp.float64) -> wp.float32:
     """Return the float32 at which a sample reaches a level from below (direction 1) or above (-1)."""
     if level == base:
         return wp.float32(base)
-    slack = wp.max(half_ulp, _STEP_ROUNDING * wp.abs(level - base))
+    slack = wp.max(_half_ulp(wp.float32(base)), _STEP_ROUNDING * wp.abs(level - base))
     return wp.float32(level - direction * slack)
 
 
 @wp.func
-def reach_down(
-    base: wp.float64, up: wp.int32, down: wp.int32, threshold_on: wp.float64, threshold_off: wp.float64
-) -> wp.float32:
+def reach_down(levels: Levels, up: wp.int32, down: wp.int32) -> wp.float32:
     """Return the largest sample that reaches the level below."""
-    level = level_at(base, up, down + 1, threshold_on, threshold_off)
-    return _bound(level, base, _half_ulp(wp.float32(base)), wp.float64(-1.0))
+    return _bound(level_at(levels, up, down + 1), levels.base, wp.float64(-1.0))
 
 
 @wp.func
-def reach_up(
-    base: wp.float64, up: wp.int32, down: wp.int32, threshold_on: wp.float64, threshold_off: wp.float64
-) -> wp.float32:
+def reach_up(levels: Levels, up: wp.int32, down: wp.int32) -> wp.float32:
     """Return the least sample that reaches the level above."""
-    level = level_at(base, up + 1, down, threshold_on, threshold_off)
-    return _bound(level, base, _half_ulp(wp.float32(base)), wp.float64(1.0))
+    return _bound(level_at(levels, up + 1, down), levels.base, wp.float64(1.0))
 
 
 @wp.func
-def quiet_range(
-    base: wp.float64, up: wp.int32, down: wp.int32, threshold_on: wp.float64, threshold_off: wp.float64
-) -> wp.vec2:
+def quiet_range(levels: Levels, up: wp.int32, down: wp.int32) -> wp.vec2:
     """Return the samples that reach the level below and the level above; between them a pixel is quiet."""
-    return wp.vec2(
-        reach_down(base, up, down, threshold_on, threshold_off),
-        reach_up(base, up, down, threshold_on, threshold_off),
-    )
+    return wp.vec2(reach_down(levels, up, down), reach_up(levels, up, down))
 
 
 @wp.func
@@ -121,67 +147,38 @@ def key_after(
 
 
 @wp.func
-def _key(
-    level: wp.float64,
-    last: wp.float64,
-    sample: wp.float64,
-    start_ns: wp.int64,
-    end_ns: wp.int64,
-    place: wp.int64,
-    time_shift: wp.int32,
-    polarity: wp.int32,
-) -> wp.int64:
-    """Return the key of the crossing of a level on the line from (start_ns, last) to (end_ns, sample)."""
-    fraction = wp.min((level - last) / (sample - last), wp.float64(1.0))
-    return key_after(wp.float64(end_ns - start_ns) * fraction, start_ns, place, time_shift, polarity)
-
-
-@wp.func
-def place_of(pixel: wp.int32, row: wp.int32, width: wp.int32, row_shift: wp.int32) -> wp.int64:
+def place_of(pixel: wp.int32, row: wp.int32, layout: KeyLayout) -> wp.int64:
     """Return the bits of a key that say which pixel it is."""
-    return (wp.int64(row) << wp.int64(row_shift)) | (wp.int64(pixel - row * width) << COLUMN_SHIFT)
+    column = wp.int64(pixel - row * layout.width)
+    return (wp.int64(row) << wp.int64(layout.row_shift)) | (column << wp.int64(layout.column_shift))
 
 
 @wp.func
-def rise(
-    sample: wp.float32,
-    base: wp.float64,
-    up: wp.int32,
-    down: wp.int32,
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
-) -> wp.int32:
+def rise(sample: wp.float32, levels: Levels, up: wp.int32, down: wp.int32) -> wp.int32:
     """Return `up` when a sample that has reached the level above has crossed all that it reaches."""
     least = up + 1
-    if sample < reach_up(base, least, down, threshold_on, threshold_off):
+    if sample < reach_up(levels, least, down):
         return least
-    level = level_at(base, least, down, threshold_on, threshold_off)
-    found = least + wp.int32((wp.float64(sample) - level) / threshold_on)  # but for rounding
-    while sample >= reach_up(base, found, down, threshold_on, threshold_off):
+    level = level_at(levels, least, down)
+    found = least + wp.int32((wp.float64(sample) - level) / levels.on)  # but for rounding
+    while sample >= reach_up(levels, found, down):
         found += 1
-    while found > least and sample < reach_up(base, found - 1, down, threshold_on, threshold_off):
+    while found > least and sample < reach_up(levels, found - 1, down):
         found -= 1
     return found
 
 
 @wp.func
-def fall(
-    sample: wp.float32,
-    base: wp.float64,
-    up: wp.int32,
-    down: wp.int32,
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
-) -> wp.int32:
+def fall(sample: wp.float32, levels: Levels, up: wp.int32, down: wp.int32) -> wp.int32:
     """Return `down` when a sample that has reached the level below has crossed all that it reaches."""
     least = down + 1
-    if sample > reach_down(base, up, least, threshold_on, threshold_off):
+    if sample > reach_down(levels, up, least):
         return least
-    level = level_at(base, up, least, threshold_on, threshold_off)
-    found = least + wp.int32((level - wp.float64(sample)) / threshold_off)
-    while sample <= reach_down(base, up, found, threshold_on, threshold_off):
+    level = level_at(levels, up, least)
+    found = least + wp.int32((level - wp.float64(sample)) / levels.off)
+    while sample <= reach_down(levels, up, found):
         found += 1
-    while found > least and sample > reach_down(base, up, found - 1, threshold_on, threshold_off):
+    while found > least and sample > reach_down(levels, up, found - 1):
         found -= 1
     return found
 
@@ -189,11 +186,9 @@ def fall(
 @wp.func
 def key_of_level(
     event: wp.int32,
-    base: wp.float64,
+    levels: Levels,
     up: wp.int32,
     down: wp.int32,
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
     last: wp.float32,
     sample: wp.float32,
     start_ns: wp.int64,
@@ -201,9 +196,12 @@ def key_of_level(
     place: wp.int64,
     time_shift: wp.int32,
 ) -> wp.int64:
-    """Return the key of one of the events between two samples, from `up` and `down` at the first of them."""
+    """Return the key of one of the events between two samples, from `up` and `down` at the first of them.
+
+    It is where the line from (start_ns, last) to (end_ns, sample) crosses a level.
+    """
     polarity = wp.where(sample > last, 1, 0)
-    level = level_at(
-        base, up + (event + 1) * polarity, down + (event + 1) * (1 - polarity), threshold_on, threshold_off
-    )
-    return _key(level, wp.float64(last), wp.float64(sample), start_ns, end_ns, place, time_shift, polarity)
+    level = level_at(levels, up + (event + 1) * polarity, down + (event + 1) * (1 - polarity))
+    begin = wp.float64(last)
+    fraction = wp.min((level - begin) / (wp.float64(sample) - begin), wp.float64(1.0))
+    return key_after(wp.float64(end_ns - start_ns) * fraction, start_ns, place, time_shift, polarity)

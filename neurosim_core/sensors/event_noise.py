@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,arg-type,call-overload,assignment,no-untyped-def,attr-defined"
-"""The pixels of an event camera that are not ideal: their parameters as drawn, and their states.
+"""The pixels of an event camera that are not ideal: their parameters, as drawn.
 
 What each term does is described in `event_noise_model`, and a pixel is scanned in `event_noise_scan`.
 
@@ -9,7 +9,7 @@ depends on how frames are split into calls, nor on threads.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,29 +17,34 @@ import warp as wp
 
 from neurosim_core.random import normal2, random_bits, stream_id, uniform2
 from neurosim_core.sensors.event_config import EventCameraConfig, MeasuredNoiseConfig
-from neurosim_core.sensors.event_noise_model import Memory, PixelModel
+from neurosim_core.sensors.event_noise_model import PixelModel, SignalTerm
 from neurosim_core.sensors.event_noise_pixel import signal_terms
-from neurosim_core.sensors.event_terms import SignalTerm
 
 wp.set_module_options({"enable_backward": False})
 
 _ZERO = wp.constant(wp.float64(0.0))
 
 
-@wp.kernel
-def _draw_thresholds(
-    # Model:
-    nominal: wp.vec2d,
-    deviation: wp.vec2d,
-    minimum: wp.float64,
-    seed: wp.uint64,
-    stream: wp.uint32,
-    # Out:
-    threshold_out: wp.array[wp.vec2d],
-) -> None:
-    pixel = wp.tid()
-    value = nominal + wp.cw_mul(deviation, normal2(random_bits(seed, stream, wp.int64(0), pixel)))
-    threshold_out[pixel] = wp.vec2d(wp.max(value[0], minimum), wp.max(value[1], minimum))
+@wp.struct
+class _Spread:
+    """How what stays in pixels differs from pixel to pixel, times in ns."""
+
+    seed: wp.uint64
+    threshold_stream: wp.uint32
+    leak_stream: wp.uint32
+    leak_phase_stream: wp.uint32
+    shot_stream: wp.uint32
+    hot_stream: wp.uint32
+    threshold: wp.vec2d  # Standard deviations ON, OFF
+    threshold_least: wp.float64
+    leak_rate: wp.float64
+    leak_decades: wp.float64
+    shot_rate: wp.float64
+    shot_decades: wp.float64
+    hot_fraction: wp.float64
+    hot_rate: wp.float64
+    measured: wp.array[wp.vec3d]  # Of each light: median rates ON and OFF, decades; or
+    sampled: wp.array2d[wp.vec2]  # rates of pixels that were measured, shape [light, pixel]
 
 
 @wp.func
@@ -48,74 +53,50 @@ def _spread_rate(rate: wp.float64, decades: wp.float64, normal: wp.float64) -> w
 
 
 @wp.kernel
-def _draw_leak(
+def _draw_pixels(
     # Model:
-    rate_per_ns: wp.float64,
-    decades: wp.float64,
-    seed: wp.uint64,
-    rate_stream: wp.uint32,
-    phase_stream: wp.uint32,
-    # Out:
-    leak_out: wp.array[wp.vec2d],
-) -> None:
-    pixel = wp.tid()
-    normal = normal2(random_bits(seed, rate_stream, wp.int64(0), pixel))
-    phase = uniform2(random_bits(seed, phase_stream, wp.int64(0), pixel))[0]
-    if rate_per_ns == _ZERO:
-        phase = _ZERO
-    leak_out[pixel] = wp.vec2d(_spread_rate(rate_per_ns, decades, normal[0]), phase)
-
-
-@wp.kernel
-def _draw_rates(
-    # Model:
-    shot_per_ns: wp.float64,
-    decades: wp.float64,
-    hot_fraction: wp.float64,
-    hot_per_ns: wp.float64,
-    seed: wp.uint64,
-    rate_stream: wp.uint32,
-    hot_stream: wp.uint32,
+    spread: _Spread,
+    # In/out:
     model: PixelModel,
-    # Out:
-    rate_out: wp.array[wp.vec2d],
 ) -> None:
+    """Draw what stays in a pixel, of the terms whose arrays are not empty."""
     pixel = wp.tid()
-    normal = normal2(random_bits(seed, rate_stream, wp.int64(0), pixel))
-    hot = uniform2(random_bits(seed, hot_stream, wp.int64(0), pixel))[0] < hot_fraction
-    shot = _spread_rate(shot_per_ns, decades, normal[0])
-    if model.shot_by_threshold and model.thresholds.shape[0] > 0:
-        on = model.shot_on_fraction * model.threshold_on / model.thresholds[pixel][0]
-        off = (wp.float64(1.0) - model.shot_on_fraction) * model.threshold_off / model.thresholds[pixel][1]
-        shot *= on + off
-    rate_out[pixel] = wp.vec2d(shot, wp.where(hot, hot_per_ns, _ZERO))
-
-
-@wp.kernel
-def _draw_measured(
-    # Model:
-    medians: wp.array[wp.vec3d],
-    sampled: wp.array2d[wp.vec2],
-    seed: wp.uint64,
-    stream: wp.uint32,
-    # Out:
-    level_rate_out: wp.array2d[wp.vec2],
-    rate_out: wp.array[wp.vec2d],
-) -> None:
-    """Draw the rates of a pixel in all lights, from medians (ON, OFF, spread) or from a measured pixel."""
-    pixel = wp.tid()
-    bits = random_bits(seed, stream, wp.int64(0), pixel)
-    most = _ZERO
-    for level in range(level_rate_out.shape[0]):
-        rates = wp.vec2()
-        if sampled.shape[0] > 0:
-            rates = sampled[level, wp.int32(uniform2(bits)[0] * wp.float64(sampled.shape[1]))]
-        else:
-            factor = _spread_rate(wp.float64(1.0), medians[level][2], normal2(bits)[0])
-            rates = wp.vec2(wp.float32(medians[level][0] * factor), wp.float32(medians[level][1] * factor))
-        level_rate_out[level, pixel] = rates
-        most = wp.max(most, wp.float64(rates[0]) + wp.float64(rates[1]))
-    rate_out[pixel] = wp.vec2d(most, rate_out[pixel][1])
+    first = wp.int64(0)
+    if model.thresholds.shape[0] > 0:
+        normal = normal2(random_bits(spread.seed, spread.threshold_stream, first, pixel))
+        value = wp.vec2d(model.threshold_on, model.threshold_off) + wp.cw_mul(spread.threshold, normal)
+        least = spread.threshold_least
+        model.thresholds[pixel] = wp.vec2d(wp.max(value[0], least), wp.max(value[1], least))
+    if model.leak.shape[0] > 0:
+        normal = normal2(random_bits(spread.seed, spread.leak_stream, first, pixel))
+        phase = _ZERO
+        if spread.leak_rate != _ZERO:
+            phase = uniform2(random_bits(spread.seed, spread.leak_phase_stream, first, pixel))[0]
+        rate = _spread_rate(spread.leak_rate, spread.leak_decades, normal[0])
+        model.leak[pixel] = wp.vec2d(rate, phase)
+    if model.rates.shape[0] > 0:
+        bits = random_bits(spread.seed, spread.shot_stream, first, pixel)
+        shot = _spread_rate(spread.shot_rate, spread.shot_decades, normal2(bits)[0])
+        if model.shot_by_threshold and model.thresholds.shape[0] > 0:
+            steady = model.thresholds[pixel]
+            on = model.shot_on_fraction * model.threshold_on / steady[0]
+            off = (wp.float64(1.0) - model.shot_on_fraction) * model.threshold_off / steady[1]
+            shot *= on + off
+        if model.noise_rates.shape[0] > 0:
+            shot = _ZERO
+        for level in range(model.noise_rates.shape[0]):
+            rates = wp.vec2()
+            if spread.sampled.shape[0] > 0:
+                place = uniform2(bits)[0] * wp.float64(spread.sampled.shape[1])
+                rates = spread.sampled[level, wp.int32(place)]
+            else:
+                median = spread.measured[level]
+                factor = _spread_rate(wp.float64(1.0), median[2], normal2(bits)[0])
+                rates = wp.vec2(wp.float32(median[0] * factor), wp.float32(median[1] * factor))
+            model.noise_rates[level, pixel] = rates
+            shot = wp.max(shot, wp.float64(rates[0]) + wp.float64(rates[1]))
+        hot = uniform2(random_bits(spread.seed, spread.hot_stream, first, pixel))[0] < spread.hot_fraction
+        model.rates[pixel] = wp.vec2d(shot, wp.where(hot, spread.hot_rate, _ZERO))
 
 
 def mix_seed(seed: int, stamp_ns: int) -> int:
@@ -126,7 +107,7 @@ def mix_seed(seed: int, stamp_ns: int) -> int:
     return mixed ^ (mixed >> 31)
 
 
-def read_noise(config: MeasuredNoiseConfig) -> tuple[Any, Any, Any]:
+def _read_noise(config: MeasuredNoiseConfig) -> tuple[Any, Any, Any]:
     """Return light [lux], shape [L], medians and spread by light, [L, 3], and rates of pixels, [L, P, 2].
 
     Rates are per ns; one of the two is empty.
@@ -154,175 +135,106 @@ def read_noise(config: MeasuredNoiseConfig) -> tuple[Any, Any, Any]:
     return lux, np.zeros((0, 3)), rates.astype(np.float32)
 
 
-class PixelNoise:
-    """The pixels of an event camera that are not ideal: what stays, and what they remember, in a ring.
+def make_model(
+    config: EventCameraConfig, *, pixel_count: int, seed: int, sensor: str, device: Any, terms: Sequence[str]
+) -> PixelModel:
+    """Return what the scan reads of pixels that stays; numbers in time are those of a reset at `seed`.
 
-    Cameras with different names have independent noise.
-
-    Attributes:
-        terms: The terms that are compiled in.
-        model: What the scan reads of pixels that stays, a `PixelModel`.
-        memories: What pixels remember, a `Memory` for each state of the ring.
+    Args:
+        config: The pixels.
+        pixel_count: How many there are.
+        seed: What is drawn depends on it.
+        sensor: Likewise: cameras with different names have independent noise.
+        device: Warp device.
+        terms: What is compiled in; there may be some that the configuration does not ask for.
     """
 
-    def __init__(
-        self,
-        config: EventCameraConfig,
-        *,
-        pixel_count: int,
-        ring_size: int,
-        seed: int,
-        sensor: str,
-        device: Any,
-        terms: Sequence[str],
-    ) -> None:
-        self.terms = tuple(terms)
-        self._config = config
-        self._seed = seed
-        self._sensor = sensor
-        self._device = wp.get_device(device)
-        self._pixel_count = pixel_count
-        self.memories = [self._make_memory() for _ in range(ring_size)]
-        self.model = self._make_model()
+    def array(dtype: Any, *needed_by: str) -> Any:
+        return wp.zeros(pixel_count if set(needed_by) & set(terms) else 0, dtype=dtype, device=device)
 
-    def set_reset(self, stamp_ns: int) -> None:
-        """Let the noise that follows be that after a reset at a stamp."""
-        self.model.seed = mix_seed(self._seed, stamp_ns)
+    def stream(use: str) -> int:
+        return stream_id(f"{sensor}/events/{use}")
 
-    def phase(self) -> tuple[int, bool]:
-        """Return the stream of random phases, and whether voltages begin at one."""
-        stochastic = self._config.stochastic
-        return self._stream("phase"), stochastic is not None and stochastic.random_phase
+    model = PixelModel()
+    model.threshold_on = config.threshold_on
+    model.threshold_off = config.threshold_off
+    model.white_radiance = config.white_radiance
+    model.log_white = math.log(config.white_radiance)
+    model.refractory_ns = 1e9 * config.refractory_s
+    if (jitter := config.threshold_jitter) is not None:
+        model.jitter, model.jitter_least = wp.vec2d(jitter.sigma_on, jitter.sigma_off), jitter.minimum
+    model.signals = _make_signals(config, seed, stream, terms, device)
+    if config.low_pass is not None:
+        model.corner_per_ns = 2e-9 * math.pi * config.low_pass.cutoff_hz
+        model.dark_radiance = config.low_pass.dark_radiance
+    elif "low_pass" in terms:
+        model.corner_per_ns = 1e9
+    if (stochastic := config.stochastic) is not None:
+        model.k1, model.k2 = stochastic.k1, stochastic.k2
+        model.k3, model.k6 = (k / math.sqrt(1e3) for k in (stochastic.k3, stochastic.k6))
+        model.k4, model.k5 = (k / 1e3 for k in (stochastic.k4, stochastic.k5))
+        model.random_phase = stochastic.random_phase
+    model.seed = seed
+    model.spontaneous_stream = stream("noise")
+    model.step_stream = stream("voltage")
+    model.touch_stream = stream("passage")
+    model.jitter_stream = stream("jitter")
+    model.phase_stream = stream("phase")
+    model.thresholds = array(wp.vec2d, "spread")
+    model.leak = array(wp.vec2d, "leak")
+    model.rates = array(wp.vec2d, "spontaneous")
+    _draw(config, model, seed, stream, terms, pixel_count, device)
+    return model
 
-    def _stream(self, use: str) -> int:
-        return stream_id(f"{self._sensor}/events/{use}")
 
-    def _has(self, *terms: str) -> bool:
-        return any(term in self.terms for term in terms)
+def _draw(
+    config: EventCameraConfig,
+    model: PixelModel,
+    seed: int,
+    stream: Callable[[str], int],
+    terms: Sequence[str],
+    pixel_count: int,
+    device: Any,
+) -> None:
+    """Draw what differs from pixel to pixel."""
+    spread = _Spread()
+    spread.seed = seed
+    spread.threshold_stream, spread.shot_stream, spread.hot_stream = map(stream, ("threshold", "shot", "hot"))
+    spread.leak_stream, spread.leak_phase_stream = stream("leak"), stream("leak_phase")
+    if (mismatch := config.threshold_spread) is not None:
+        spread.threshold = wp.vec2d(mismatch.sigma_on, mismatch.sigma_off)
+        spread.threshold_least = mismatch.minimum
+    if (leak := config.leak) is not None:
+        spread.leak_rate, spread.leak_decades = 1e-9 * leak.rate_hz, leak.spread_decades
+        model.leak_growth = leak.bright_factor - 1.0
+    if (shot := config.shot_noise) is not None:
+        spread.shot_rate, spread.shot_decades = 1e-9 * shot.rate_hz, shot.spread_decades
+        model.bright_factor, model.shot_on_fraction = shot.bright_factor, shot.on_fraction
+        model.shot_by_threshold = shot.by_threshold
+    if (hot := config.hot_pixels) is not None:
+        spread.hot_fraction, spread.hot_rate = hot.fraction, 1e-9 * hot.rate_hz
+        model.hot_on_fraction = hot.on_fraction
+    if (measured := config.measured_noise) is not None and "measured" in terms:
+        light, medians, sampled = _read_noise(measured)
+        light = np.log(light * config.white_radiance / measured.white_lux)
+        model.noise_light = wp.array(light, dtype=wp.float64, device=device)
+        model.noise_rates = wp.zeros((len(light), pixel_count), dtype=wp.vec2, device=device)
+        spread.measured = wp.array(medians, dtype=wp.vec3d, device=device)
+        spread.sampled = wp.array(sampled, dtype=wp.vec2, device=device)
+    wp.launch(_draw_pixels, dim=pixel_count, inputs=[spread, model], device=device)
 
-    def _array(self, dtype: Any, needed: bool) -> Any:
-        return wp.zeros(self._pixel_count if needed else 0, dtype=dtype, device=self._device)
 
-    def _make_memory(self) -> Any:
-        memory = Memory()
-        memory.reference = self._array(wp.float64, self._has("refractory", "spontaneous", "jitter"))
-        memory.event_count = self._array(wp.int32, self._has("jitter"))
-        memory.filtered = self._array(wp.float64, self._has("low_pass"))
-        memory.exposure_ns = self._array(wp.float64, self._has("light_leak"))
-        memory.held_ns = self._array(wp.float64, self._has("refractory"))
-        memory.next_ns = self._array(wp.int64, self._has("spontaneous"))
-        memory.noise_count = self._array(wp.int32, self._has("spontaneous"))
-        memory.voltage = self._array(wp.float64, self._has("stochastic"))
-        return memory
-
-    def _make_model(self) -> Any:
-        config = self._config
-        model = PixelModel()
-        model.threshold_on = config.threshold_on
-        model.threshold_off = config.threshold_off
-        model.white_radiance = config.white_radiance
-        model.log_white = math.log(config.white_radiance)
-        model.refractory_ns = 1e9 * config.refractory_s
-        if (jitter := config.threshold_jitter) is not None:
-            model.jitter, model.jitter_least = wp.vec2d(jitter.sigma_on, jitter.sigma_off), jitter.minimum
-        model.signals = self._make_signals()
-        if config.low_pass is not None:
-            model.corner_per_ns = 2e-9 * math.pi * config.low_pass.cutoff_hz
-            model.dark_radiance = config.low_pass.dark_radiance
-        elif self._has("low_pass"):
-            model.corner_per_ns = 1e9
-        if config.leak is not None:
-            model.leak_growth = config.leak.bright_factor - 1.0
-        if config.shot_noise is not None:
-            model.bright_factor = config.shot_noise.bright_factor
-            model.shot_on_fraction = config.shot_noise.on_fraction
-            model.shot_by_threshold = config.shot_noise.by_threshold
-        if config.hot_pixels is not None:
-            model.hot_on_fraction = config.hot_pixels.on_fraction
-        if config.stochastic is not None:
-            model.k1, model.k2 = config.stochastic.k1, config.stochastic.k2
-            model.k3, model.k6 = (k / math.sqrt(1e3) for k in (config.stochastic.k3, config.stochastic.k6))
-            model.k4, model.k5 = (k / 1e3 for k in (config.stochastic.k4, config.stochastic.k5))
-        model.spontaneous_stream = self._stream("noise")
-        model.step_stream = self._stream("voltage")
-        model.touch_stream = self._stream("passage")
-        model.jitter_stream = self._stream("jitter")
-        model.thresholds = self._draw_thresholds()
-        model.leak = self._draw_leak()
-        model.rates = self._draw_rates(model)
-        if config.measured_noise is not None and self._has("measured"):
-            light, medians, sampled = read_noise(config.measured_noise)
-            light = np.log(light * config.white_radiance / config.measured_noise.white_lux)
-            model.noise_light = wp.array(light, dtype=wp.float64, device=self._device)
-            model.noise_rates = wp.zeros((len(light), self._pixel_count), dtype=wp.vec2, device=self._device)
-            wp.launch(
-                _draw_measured,
-                dim=self._pixel_count,
-                inputs=[
-                    wp.array(medians, dtype=wp.vec3d, device=self._device),
-                    wp.array(sampled, dtype=wp.vec2, device=self._device),
-                    self._seed,
-                    self._stream("shot"),
-                ],
-                outputs=[model.noise_rates, model.rates],
-                device=self._device,
-            )
-        return model
-
-    def _make_signals(self) -> Any:
-        """Return what changes what pixels see; terms without settings have numbers 0."""
-        config = self._config
-        given = {term: each for each in config.noise for term in each.terms()} | {"lin_log": config.lin_log}
-        terms = []
-        for name, _ in signal_terms(self.terms):
-            term = SignalTerm()
-            settings = given.get(name)
-            numbers = () if settings is None else settings.numbers(config.white_radiance)
-            term.numbers = wp.vec4d(*numbers, *[0.0] * (4 - len(numbers)))
-            term.seed, term.stream = self._seed, self._stream(name)
-            terms.append(term)
-        return wp.array(terms, dtype=SignalTerm, device=self._device)
-
-    def _draw(self, kernel: Any, out: Any, *parameters: Any) -> Any:
-        if out.shape[0] > 0:
-            wp.launch(kernel, dim=out.shape[0], inputs=[*parameters], outputs=[out], device=self._device)
-        return out
-
-    def _draw_thresholds(self) -> Any:
-        config, spread = self._config, self._config.threshold_spread
-        return self._draw(
-            _draw_thresholds,
-            self._array(wp.vec2d, self._has("spread")),
-            wp.vec2d(config.threshold_on, config.threshold_off),
-            wp.vec2d(*((0.0, 0.0) if spread is None else (spread.sigma_on, spread.sigma_off))),
-            0.0 if spread is None else spread.minimum,
-            self._seed,
-            self._stream("threshold"),
-        )
-
-    def _draw_leak(self) -> Any:
-        leak = self._config.leak
-        return self._draw(
-            _draw_leak,
-            self._array(wp.vec2d, self._has("leak")),
-            0.0 if leak is None else 1e-9 * leak.rate_hz,
-            0.0 if leak is None else leak.spread_decades,
-            self._seed,
-            self._stream("leak"),
-            self._stream("leak_phase"),
-        )
-
-    def _draw_rates(self, model: Any) -> Any:
-        shot, hot = self._config.shot_noise, self._config.hot_pixels
-        return self._draw(
-            _draw_rates,
-            self._array(wp.vec2d, self._has("spontaneous")),
-            0.0 if shot is None else 1e-9 * shot.rate_hz,
-            0.0 if shot is None else shot.spread_decades,
-            0.0 if hot is None else hot.fraction,
-            0.0 if hot is None else 1e-9 * hot.rate_hz,
-            self._seed,
-            self._stream("shot"),
-            self._stream("hot"),
-            model,
-        )
+def _make_signals(
+    config: EventCameraConfig, seed: int, stream: Callable[[str], int], terms: Sequence[str], device: Any
+) -> Any:
+    """Return what changes what pixels see; terms without settings have numbers 0."""
+    given = {term: each for each in config.noise for term in each.terms()} | {"lin_log": config.lin_log}
+    signals = []
+    for name, _ in signal_terms(terms):
+        term = SignalTerm()
+        settings = given.get(name)
+        numbers = () if settings is None else settings.numbers(config.white_radiance)
+        term.numbers = wp.vec4d(*numbers, *[0.0] * (4 - len(numbers)))
+        term.seed, term.stream = seed, stream(name)
+        signals.append(term)
+    return wp.array(signals, dtype=SignalTerm, device=device)

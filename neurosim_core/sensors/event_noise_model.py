@@ -1,4 +1,5 @@
-"""What is not ideal in event pixels: the law of each term, its parameters, and what pixels remember of it.
+# mypy: disable-error-code="misc,attr-defined"
+"""What is not ideal in event pixels: the law of each term, its parameters, and the base of its settings.
 
 **Photoreceptor** (term low_pass). tau(I) dy/dt = L - y, solved exactly for log radiance L that is linear in
 time and tau that is constant; an interval is cut where L moves by more than 1/8, and tau is taken in the
@@ -36,10 +37,15 @@ DVS-Voltmeter, ECCV; Beghin, Orsingher (1999), On the maximum of the generalized
 Schucany, Haas (1976), Generating random variates using transformations with multiple roots.
 """
 
-import warp as wp
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar
 
-from neurosim_core.sensors.event_config import EventCameraConfig
-from neurosim_core.sensors.event_terms import NoiseTermConfig, SignalTerm
+import warp as wp
+from pydantic import ValidationError
+
+from neurosim_core.config_errors import explain
+from neurosim_core.registry import find
+from neurosim_core.settings import Settings
 
 wp.set_module_options({"enable_backward": False})
 
@@ -53,6 +59,15 @@ CAUSE = "cause"
 CAUSES = ("signal", "leak", "shot noise", "hot pixel", "threshold noise")
 """Why pixels fire."""
 CAUSE_BITS = 3
+
+
+@wp.struct
+class SignalTerm:
+    """What the device function of a term reads that stays."""
+
+    numbers: wp.vec4d  # `NoiseTermConfig.numbers`
+    seed: wp.uint64  # Seed of what stays in the pixels
+    stream: wp.uint32  # Of the random numbers of the term in this camera
 
 
 @wp.struct
@@ -85,6 +100,8 @@ class PixelModel:
     step_stream: wp.uint32
     touch_stream: wp.uint32
     jitter_stream: wp.uint32
+    phase_stream: wp.uint32
+    random_phase: wp.bool  # voltages begin at random ones
     thresholds: wp.array[wp.vec2d]  # ON, OFF
     leak: wp.array[wp.vec2d]  # cycles per ns, phase in cycles
     rates: wp.array[wp.vec2d]  # shot noise in the dark, or at most, and hot pixel, per ns
@@ -92,26 +109,76 @@ class PixelModel:
     noise_rates: wp.array2d[wp.vec2]  # ON and OFF, shape [light, pixel], per ns
 
 
-@wp.struct
-class Memory:
-    """What pixels remember beside their last sample and the levels they crossed, shape [pixel]."""
-
-    reference: wp.array[wp.float64]
-    """What `base` is to an ideal pixel; changes at resets (refractory, spontaneous) and events (jitter)."""
-    event_count: wp.array[wp.int32]  # Events since the reset, which number the draws of thresholds
-    filtered: wp.array[wp.float64]  # Output of the photoreceptor
-    exposure_ns: wp.array[wp.float64]  # Light since the reset, in units of white, times time
-    held_ns: wp.array[wp.float64]  # Time in reset that is left; negative: not in reset
-    next_ns: wp.array[wp.int64]  # Time of the next noise event that may be, since the reset
-    noise_count: wp.array[wp.int32]  # Its number
-    voltage: wp.array[wp.float64]  # Of the Brownian motion, in thresholds
+_SIGNAL = (SignalTerm, wp.uint64, wp.int32, wp.int64, wp.float64)
 
 
-def terms_of(config: EventCameraConfig) -> tuple[str, ...]:
-    """Return the terms that a configuration asks for; none: the pixels are ideal."""
-    groups = [getattr(config, name) for name in type(config).model_fields]
-    terms = [each for each in (*groups, *config.noise) if isinstance(each, NoiseTermConfig)]
-    present = {name for term in terms for name in term.terms()}
-    if config.refractory_s > 0.0:
-        present.add("refractory")
-    return (*(term for term in TERMS if term in present), *sorted(present - set(TERMS)))
+class NoiseTermConfig(Settings):
+    """A way in which pixels depart from the ideal; a package registers its own as `noise`, by kind.
+
+    A term of another package changes what a pixel sees: it extends this class by its `kind`, its keys,
+    `numbers` and `signal`, and is asked for under `noise` of the pixel. It acts on log radiance after
+    `lin_log` and before the photoreceptor; of several, in the alphabetical order of their kinds.
+    """
+
+    compiled: ClassVar[tuple[str, ...]] = ()
+    """Some of `TERMS` that are compiled in for it; none: `signal` is, under its kind."""
+    signal: ClassVar[Any] = None
+    """Device function (`wp.func`): from a `SignalTerm`, the seed of numbers that change with time (uint64),
+    the index of the pixel, row by row (int32), the time since the reset [ns] (int64) and log radiance
+    (float64) to what the pixel sees at that time (float64). Between two frames that is linear in time.
+    A number that meets a float64 is written `wp.float64(0.5)`: Warp converts none.
+    Random numbers are addressed: `random_bits(seed, term.stream, since_reset_ns, pixel)` for what changes
+    with every frame, `random_bits(term.seed, term.stream, 0, pixel)` for what stays."""
+
+    def numbers(self, white_radiance: float) -> tuple[float, ...]:
+        """Return what `SignalTerm.numbers` holds, at most four.
+
+        Args:
+            white_radiance: Radiance that counts as white (`EventCameraConfig.white_radiance`).
+        """
+        return ()
+
+    def terms(self) -> tuple[str, ...]:
+        """Return the names of what is compiled in."""
+        return self.compiled or (type(self).model_fields["kind"].default,)
+
+    @classmethod
+    def check_class(cls) -> None:
+        """Refuse a term of which there is nothing to compile.
+
+        Raises:
+            TypeError: `signal` is missing, or takes something else.
+        """
+        if cls.compiled:
+            return
+        taken = getattr(cls.signal, "input_types", None)
+        if taken is None or tuple(taken.values()) != _SIGNAL:
+            wanted = ", ".join(kind.__name__ for kind in _SIGNAL)
+            raise TypeError(f"{cls.__qualname__}.signal must be a wp.func of ({wanted}), got {taken}")
+        if "kind" not in cls.model_fields:
+            raise TypeError(f'{cls.__qualname__} must have a field `kind`, such as kind: Literal["flicker"]')
+
+
+def parse_terms(given: Any) -> Any:
+    """Return terms that settings name by their kind, for validators of mode "before".
+
+    Raises:
+        ValueError: There is no such kind, or a key is wrong.
+    """
+    if not isinstance(given, Iterable) or isinstance(given, str | Mapping):
+        return given
+    return tuple(_parse(each) for each in given)
+
+
+def _parse(given: Any) -> Any:
+    if not isinstance(given, Mapping):
+        return given
+    if not isinstance(given.get("kind"), str):
+        raise ValueError("a term is {kind: NAME, ...}")
+    kind: type[NoiseTermConfig] = find("noise", given["kind"])
+    if kind.compiled:
+        raise ValueError(f"{given['kind']} is a key of the pixel: {{{given['kind']}: {{...}}}}")
+    try:
+        return kind.model_validate(given)
+    except ValidationError as error:
+        raise ValueError(f"{given['kind']}: {'; '.join(explain(kind, error))}") from None

@@ -1,4 +1,5 @@
 # mypy: disable-error-code="index,arg-type,operator,call-overload,assignment,no-untyped-def,return-value"
+# mypy: disable-error-code="attr-defined,misc"
 """The scan of an event pixel that is not ideal, made to measure: only the terms that are asked for.
 
 The signal of a pixel, its log radiance through the photoreceptor plus what its reference has leaked, is known
@@ -13,31 +14,45 @@ from typing import Any
 
 import warp as wp
 
-from neurosim_core.sensors.event_levels import COLUMN_SHIFT, key_after, level_at, quiet_range
-from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, CAUSES, Memory, PixelModel
+from neurosim_core.sensors.event_levels import SUB_BITS, KeyLayout, key_after, level_at, place_of
+from neurosim_core.sensors.event_noise_model import CAUSE, CAUSES, PixelModel
 from neurosim_core.sensors.event_noise_pixel import (
     NEVER,
+    Crossing,
+    Interval,
     NoisyPixel,
+    Signal,
+    curve_at,
+    curve_crossing,
     draw_noise,
+    first_passage,
     jittered,
+    levels_of,
     light_of,
+    line_at,
+    line_crossing,
     make_see,
     mean_light,
     measured_polarity,
     noise_polarity,
+    range_of,
+    reached,
     signal_terms,
     wait_ns,
 )
-from neurosim_core.sensors.event_scan import LIMIT, PUT, call_up, write_key
-from neurosim_core.sensors.event_signal import (
-    Crossing,
-    Signal,
-    curve_at,
-    curve_crossing,
-    first_passage,
-    line_at,
-    line_crossing,
-    reached,
+from neurosim_core.sensors.event_scan import (
+    ALL,
+    CLOSE,
+    COUNT,
+    LIMIT,
+    OPEN,
+    PUT,
+    Extent,
+    PixelState,
+    Stack,
+    note_invalid,
+    prefetch_samples,
+    write_key,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -56,6 +71,7 @@ _FAINTEST = wp.constant(wp.float64(1e-12))
 _BRIGHTEST = wp.constant(wp.float64(255e3))
 """Most light that a voltage is driven by, 1000 times white."""
 _DRAW_BITS = wp.constant(wp.int64(12))
+_CAUSE_SHIFT = wp.constant(wp.int64(SUB_BITS))
 
 
 @wp.func
@@ -66,30 +82,17 @@ def _digital(model: PixelModel, sample: wp.float32) -> wp.float64:
 
 
 @functools.cache
-def make_pixel_scan(terms: frozenset[str]) -> Any:
-    """Return the function that takes a pixel with only the given terms over a stack of frames.
+def make_noisy_scan(terms: frozenset[str]) -> Any:
+    """Return the kernel that does what `event_scan.scan` does, for pixels with the given terms.
 
-    Its parameters are those of the kernel of `event_kernels.make_noisy_scan`, of one world and one pixel.
+    In place of thresholds it takes a `PixelModel` of each world; `EventCameraConfig.terms` has them.
     """
     signals = signal_terms(terms)
     see, changed = make_see(signals), len(signals) > 0
-    spread = "spread" in terms
-    jitter = "jitter" in terms
-    low_pass = "low_pass" in terms
-    refractory = "refractory" in terms
-    leak = "leak" in terms
-    light_leak = "light_leak" in terms
-    measured = "measured" in terms
-    spontaneous = "spontaneous" in terms
-    stochastic = "stochastic" in terms
     cause = CAUSE in terms
-    resets = refractory or spontaneous or jitter
-    value_at = curve_at if low_pass else line_at
-    find_crossing = curve_crossing if low_pass else line_crossing
-
-    @wp.func
-    def range_of(state: NoisyPixel) -> wp.vec2:
-        return quiet_range(state.reference, state.up - state.fold, state.down, state.on, state.off)
+    resets = not terms.isdisjoint({"refractory", "spontaneous", "jitter"})
+    value_at = curve_at if "low_pass" in terms else line_at
+    find_crossing = curve_crossing if "low_pass" in terms else line_crossing
 
     @wp.func
     def next_noise(model: PixelModel, pixel: wp.int32, state: NoisyPixel) -> NoisyPixel:
@@ -101,7 +104,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
     @wp.func
     def release(signal: Signal, time_ns: wp.float64, state: NoisyPixel) -> NoisyPixel:
         """Let the reference be the signal at a time."""
-        if wp.static(stochastic):
+        if wp.static("stochastic" in terms):
             state.voltage = _ZERO
         else:
             state.reference = value_at(signal, time_ns)
@@ -113,32 +116,22 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
     @wp.func
     def react(
         model: PixelModel,
+        layout: KeyLayout,
+        world: wp.int32,
+        slot: wp.int32,
         pixel: wp.int32,
-        row: wp.int32,
-        place: wp.int64,
-        time_shift: wp.int32,
+        interval: Interval,
         signal: Signal,
-        drift: wp.float64,
-        deviation: wp.float64,
-        first_light: wp.float64,
-        light_slope: wp.float64,
-        leak_slope: wp.float64,
-        start_ns: wp.int64,
-        since_ns: wp.int64,
-        frame: wp.int32,
-        row_limit: wp.int32,
         tabulate: wp.bool,
         state: NoisyPixel,
         quiet: wp.vec2,
-        table: wp.array2d[wp.int32],
-        keys: wp.array[wp.int64],
-        counters: wp.array[wp.int64],
+        stack: Stack,
     ) -> NoisyPixel:
         """Take a pixel over one piece of the signal, event by event."""
         now = signal.begin
         draw = wp.int64(0)
         while now < signal.end:
-            if wp.static(refractory):
+            if wp.static("refractory" in terms):
                 if state.held_ns > signal.end:
                     break
                 if state.held_ns >= _ZERO:
@@ -147,41 +140,29 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                     quiet = range_of(state)
             end = signal.end
             noisy = wp.bool(False)
-            if wp.static(spontaneous):
-                while wp.float64(state.next_ns - since_ns) <= now:  # in reset
+            if wp.static("spontaneous" in terms):
+                while wp.float64(state.next_ns - interval.since_ns) <= now:  # in reset
                     state = next_noise(model, pixel, state)
-                noise_ns = wp.float64(state.next_ns - since_ns)
+                noise_ns = wp.float64(state.next_ns - interval.since_ns)
                 if noise_ns <= end:
                     end = noise_ns
                     noisy = wp.bool(True)
 
             crossing = Crossing()
-            if wp.static(stochastic):
-                ratio = wp.min(state.on, state.off) / wp.max(deviation, wp.float64(1e-30))
+            if wp.static("stochastic" in terms):
+                ratio = wp.min(state.on, state.off) / wp.max(interval.deviation, wp.float64(1e-30))
                 longest_ns = ratio * ratio / wp.float64(16.0)
                 if end - now > longest_ns:
                     end = wp.min(now + wp.max(longest_ns, _ONE), end)
                     noisy = wp.bool(False)
-                step = (since_ns << _DRAW_BITS) + draw
+                step = (interval.since_ns << _DRAW_BITS) + draw
                 draw += wp.int64(1)
-                crossing = first_passage(
-                    model.seed,
-                    model.step_stream,
-                    model.touch_stream,
-                    step,
-                    pixel,
-                    state.voltage,
-                    state.on,
-                    state.off,
-                    drift,
-                    deviation,
-                    now,
-                    end,
-                )
+                crossing = first_passage(model, step, pixel, state, interval, now, end)
                 state.voltage = crossing.voltage
             else:
-                lower = level_at(state.reference, state.up - state.fold, state.down + 1, state.on, state.off)
-                upper = level_at(state.reference, state.up - state.fold + 1, state.down, state.on, state.off)
+                levels = levels_of(state)
+                lower = level_at(levels, state.up - state.fold, state.down + 1)
+                upper = level_at(levels, state.up - state.fold + 1, state.down)
                 crossing = find_crossing(signal, now, end, quiet, lower, upper)
 
             polarity = crossing.polarity
@@ -191,11 +172,11 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 now = crossing.time_ns
             else:
                 now = end
-                if wp.static(spontaneous):  # noqa: SIM102, one of them is for the compiler
+                if wp.static("spontaneous" in terms):  # noqa: SIM102, one of them is for the compiler
                     if noisy:
-                        light = first_light + light_slope * now
+                        light = interval.light + interval.light_slope * now
                         uniform = draw_noise(model, pixel, state)[1]
-                        if wp.static(measured):
+                        if wp.static("measured" in terms):
                             polarity = measured_polarity(model, pixel, state, light, uniform)
                         else:
                             polarity = noise_polarity(model, state, light, uniform)
@@ -205,35 +186,34 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                         state = next_noise(model, pixel, state)
                         reset = wp.bool(True)
             if polarity >= 0:
+                row = pixel // layout.width
                 if tabulate:
-                    wp.atomic_add(table, frame, row, 1)
-                elif row < row_limit:
-                    where = place
+                    wp.atomic_add(stack.table, world, interval.frame, row, 1)
+                elif row < stack.row_limit[world, interval.frame]:
+                    place = place_of(pixel, row, layout)
                     if wp.static(cause):
                         if origin == _SIGNAL:
                             upwards = wp.float64(2 * polarity - 1)
-                            if wp.static(leak):  # noqa: SIM102
-                                if polarity == 1 and leak_slope > light_slope:
+                            if wp.static("leak" in terms):  # noqa: SIM102
+                                if polarity == 1 and interval.leak_slope > interval.light_slope:
                                     origin = _LEAK
-                            if wp.static(stochastic):  # noqa: SIM102
-                                if deviation * deviation > upwards * drift:
+                            if wp.static("stochastic" in terms):  # noqa: SIM102
+                                if interval.deviation * interval.deviation > upwards * interval.drift:
                                     origin = _NOISE
-                        where = place | (origin << COLUMN_SHIFT)
-                    key = key_after(now, start_ns, where, time_shift, polarity)
-                    write_key(PUT, key, keys, counters)
+                        place |= origin << _CAUSE_SHIFT
+                    key = key_after(now, interval.start_ns, place, layout.time_shift, polarity)
+                    write_key(PUT, key, stack.keys[slot], stack.counters[slot])
                 if not reset:
                     state.up += polarity
                     state.down += 1 - polarity
-                if wp.static(jitter):
+                if wp.static("jitter" in terms):
                     if not reset:
-                        state.reference = level_at(
-                            state.reference, state.up - state.fold, state.down, state.on, state.off
-                        )
+                        state.reference = level_at(levels_of(state), state.up - state.fold, state.down)
                         state.up = state.fold
                         state.down = 0
                     state.event_count += 1
                     state = jittered(model, pixel, state)
-                if wp.static(refractory):  # noqa: SIM102
+                if wp.static("refractory" in terms):  # noqa: SIM102
                     if model.refractory_ns > _ZERO:
                         state.held_ns = now + model.refractory_ns
                         reset = wp.bool(False)
@@ -245,79 +225,68 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
     @wp.func
     def scan_pixel(
         model: PixelModel,
-        width: wp.int32,
-        row_shift: wp.int32,
-        time_shift: wp.int32,
+        layout: KeyLayout,
+        world: wp.int32,
+        slot: wp.int32,
         pixel: wp.int32,
-        log_radiance: wp.array2d[wp.float32],
-        stamps: wp.array[wp.int64],
-        since_reset_ns: wp.int64,
         frame_count: wp.int32,
-        row_limit: wp.array[wp.int32],
-        base: wp.array[wp.float32],
-        last: wp.array[wp.float32],
-        crossed: wp.array[wp.vec2i],
-        before: Memory,
         tabulate: wp.bool,
-        last_out: wp.array[wp.float32],
-        crossed_out: wp.array[wp.vec2i],
-        after: Memory,
-        keys_out: wp.array[wp.int64],
-        counters_out: wp.array[wp.int64],
-        table_out: wp.array2d[wp.int32],
+        before: PixelState,
+        stack: Stack,
+        after: PixelState,
     ):
         """Take one pixel from its state before a stack to that after it."""
-        call_up(log_radiance, pixel, frame_count)
-        row = pixel // width
-        column = wp.int64(pixel - row * width)
-        if wp.static(cause):
-            column = column << wp.int64(CAUSE_BITS)
-        place = (wp.int64(row) << wp.int64(row_shift)) | (column << COLUMN_SHIFT)
+        log_radiance = stack.log_radiance[world]
+        stamps = stack.stamps[world]
+        since_reset_ns = stack.since_reset_ns[world]
+        prefetch_samples(log_radiance, pixel, frame_count)
+        base = before.base[world, pixel]
         state = NoisyPixel()
         state.on = model.threshold_on
         state.off = model.threshold_off
-        if wp.static(spread):
+        if wp.static("spread" in terms):
             state.on = model.thresholds[pixel][0]
             state.off = model.thresholds[pixel][1]
         state.steady = wp.vec2d(state.on, state.off)
-        if wp.static(stochastic):
+        if wp.static("stochastic" in terms):
             state.on = state.on / model.threshold_on
             state.off = state.off / model.threshold_off
-            state.voltage = before.voltage[pixel]
-        state.reference = wp.float64(base[pixel])
+            state.voltage = before.voltage[world, pixel]
+        state.reference = wp.float64(base)
         if wp.static(changed):
-            state.reference = see(model, pixel, wp.int64(0), base[pixel])
+            state.reference = see(model, pixel, wp.int64(0), base)
         if wp.static(resets):
-            state.reference = before.reference[pixel]
-        state.up = crossed[pixel][0]
-        state.down = crossed[pixel][1]
-        if wp.static(jitter):
+            state.reference = before.reference[world, pixel]
+        crossed = before.crossed[world, pixel]
+        state.up = crossed[0]
+        state.down = crossed[1]
+        if wp.static("jitter" in terms):
             state.fold = state.up  # levels count from the last one crossed
-            state.event_count = before.event_count[pixel]
+            state.event_count = before.event_count[world, pixel]
             state = jittered(model, pixel, state)
         state.held_ns = -_ONE
-        if wp.static(refractory):
-            state.held_ns = before.held_ns[pixel]
-        if wp.static(spontaneous):
-            state.next_ns = before.next_ns[pixel]
-            state.noise_count = before.noise_count[pixel]
+        if wp.static("refractory" in terms):
+            state.held_ns = before.held_ns[world, pixel]
+        if wp.static("spontaneous" in terms):
+            state.next_ns = before.next_ns[world, pixel]
+            state.noise_count = before.noise_count[world, pixel]
             state.shot_rate = model.rates[pixel][0]
             state.hot_rate = model.rates[pixel][1]
         filtered = _ZERO
-        if wp.static(low_pass):
-            filtered = before.filtered[pixel]
+        if wp.static("low_pass" in terms):
+            filtered = before.filtered[world, pixel]
         exposure_ns = _ZERO
-        if wp.static(light_leak):
-            exposure_ns = before.exposure_ns[pixel]
-        sample_before = last[pixel]
+        if wp.static("light_leak" in terms):
+            exposure_ns = before.exposure_ns[world, pixel]
+        sample_before = before.last[world, pixel]
         seen_last = wp.float64(sample_before)
         if wp.static(changed):
             seen_last = see(model, pixel, stamps[0] + since_reset_ns, sample_before)
         end_light = _ZERO
-        if wp.static(light_leak):
+        if wp.static("light_leak" in terms):
             end_light = light_of(model, sample_before)
         dn_end = _ZERO
-        if wp.static(stochastic):
+        if wp.static("stochastic" in terms):
             dn_end = _digital(model, sample_before)
         invalid_count = wp.int32(0)
         invalid_first = wp.int32(0)
@@ -326,11 +295,16 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
         for frame in range(frame_count):
             sample = log_radiance[frame, pixel]
             if wp.abs(sample) <= LIMIT:
-                start_ns = stamps[frame]
-                since_ns = start_ns + since_reset_ns
-                span_ns = wp.float64(stamps[frame + 1] - start_ns)
+                interval = Interval()
+                interval.frame = frame
+                interval.start_ns = stamps[frame]
+                interval.since_ns = stamps[frame] + since_reset_ns
+                since_ns = interval.since_ns
+                span_ns = wp.float64(stamps[frame + 1] - stamps[frame])
                 light = wp.float64(sample_before)
                 light_slope = (wp.float64(sample) - light) / span_ns
+                interval.light = light
+                interval.light_slope = light_slope
                 seen = seen_last  # as light, where the pixel sees its logarithm
                 seen_last = wp.float64(sample)
                 if wp.static(changed):
@@ -338,36 +312,36 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 seen_slope = (seen_last - seen) / span_ns
                 leaked = _ZERO
                 leak_slope = _ZERO
-                if wp.static(leak):
+                if wp.static("leak" in terms):
                     cycles = model.leak[pixel][1] + model.leak[pixel][0] * wp.float64(since_ns)
                     leak_slope = model.leak[pixel][0] * state.steady[0]
-                    if wp.static(light_leak):
+                    if wp.static("light_leak" in terms):
                         cycles += model.leak[pixel][0] * model.leak_growth * exposure_ns
                         begin_light = end_light
                         end_light = light_of(model, sample)
                         brightness = mean_light(model, sample_before, sample, begin_light, end_light)
                         leak_slope *= _ONE + model.leak_growth * brightness
                         exposure_ns += brightness * span_ns
+                    interval.leak_slope = leak_slope
                     whole = wp.floor(cycles)
                     leaked = (cycles - whole) * state.steady[0]
                     if wp.int32(whole) != state.fold:
-                        if wp.static(jitter):  # a cycle is worth a threshold without jitter
+                        if wp.static("jitter" in terms):  # a cycle is worth a threshold without jitter
                             state.reference -= wp.float64(wp.int32(whole) - state.fold) * state.steady[0]
                             state.up = state.up - state.fold + wp.int32(whole)
                         state.fold = wp.int32(whole)
                         quiet = range_of(state)
-                drift = _ZERO
-                deviation = _ZERO
-                if wp.static(stochastic):
+                if wp.static("stochastic" in terms):
                     dn_begin = dn_end
                     dn_end = _digital(model, sample)
                     dn = (dn_begin + dn_end) / _TWO
                     drift = model.k1 * wp.log((dn_end + model.k2) / (dn_begin + model.k2)) / span_ns
                     drift += model.k4 + model.k5 * dn
-                    deviation = model.k3 * wp.sqrt(dn) / (dn + model.k2) + model.k6
+                    interval.drift = drift
+                    interval.deviation = model.k3 * wp.sqrt(dn) / (dn + model.k2) + model.k6
 
                 pieces = wp.int32(1)
-                if wp.static(low_pass):
+                if wp.static("low_pass" in terms):
                     rise = wp.max(wp.abs(wp.float64(sample) - light), wp.abs(seen_last - seen))
                     pieces = wp.min(1 + wp.int32(rise / _PIECE), _PIECE_COUNT_MAX)
                 for piece in range(pieces):
@@ -375,7 +349,7 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                     signal.begin = span_ns * (wp.float64(piece) / wp.float64(pieces))
                     signal.end = span_ns * (wp.float64(piece + 1) / wp.float64(pieces))
                     busy = wp.bool(True)
-                    if wp.static(low_pass):
+                    if wp.static("low_pass" in terms):
                         length_ns = signal.end - signal.begin
                         seen_begin = seen + seen_slope * signal.begin
                         middle = light + light_slope * signal.begin + light_slope * length_ns / _TWO
@@ -393,44 +367,24 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                         steepness = signal.slope - decay / signal.tau
                         turns = steepness * (steepness - decay / signal.tau * gain) < _ZERO
                         busy = turns or reached(signal.last, quiet) >= 0
-                        if wp.static(refractory):
+                        if wp.static("refractory" in terms):
                             busy = busy or state.held_ns >= _ZERO
-                        if wp.static(spontaneous):
+                        if wp.static("spontaneous" in terms):
                             busy = busy or wp.float64(state.next_ns - since_ns) <= signal.end
-                    elif wp.static(not stochastic):
+                    elif wp.static("stochastic" not in terms):
                         signal.start = seen + leaked
                         signal.last = seen_last + leaked + leak_slope * span_ns
                         busy = reached(signal.last, quiet) >= 0
-                        if wp.static(refractory):
+                        if wp.static("refractory" in terms):
                             busy = busy or state.held_ns >= _ZERO
-                        if wp.static(spontaneous):
+                        if wp.static("spontaneous" in terms):
                             busy = busy or wp.float64(state.next_ns - since_ns) <= span_ns
                     if busy:
                         state = react(
-                            model,
-                            pixel,
-                            row,
-                            place,
-                            time_shift,
-                            signal,
-                            drift,
-                            deviation,
-                            light,
-                            light_slope,
-                            leak_slope,
-                            start_ns,
-                            since_ns,
-                            frame,
-                            row_limit[frame],
-                            tabulate,
-                            state,
-                            quiet,
-                            table_out,
-                            keys_out,
-                            counters_out,
+                            model, layout, world, slot, pixel, interval, signal, tabulate, state, quiet, stack
                         )
                         quiet = range_of(state)
-                if wp.static(refractory):  # noqa: SIM102
+                if wp.static("refractory" in terms):  # noqa: SIM102
                     if state.held_ns >= _ZERO:
                         state.held_ns = wp.max(state.held_ns - span_ns, _ZERO)
                 sample_before = sample
@@ -440,27 +394,55 @@ def make_pixel_scan(terms: frozenset[str]) -> Any:
                 invalid_count += 1
 
         if not tabulate:
-            last_out[pixel] = sample_before
-            crossed_out[pixel] = wp.vec2i(state.up, state.down)
+            after.last[world, pixel] = sample_before
+            after.crossed[world, pixel] = wp.vec2i(state.up, state.down)
             if wp.static(resets):
-                after.reference[pixel] = state.reference
-            if wp.static(jitter):
-                after.event_count[pixel] = state.event_count
-            if wp.static(low_pass):
-                after.filtered[pixel] = filtered
-            if wp.static(light_leak):
-                after.exposure_ns[pixel] = exposure_ns
-            if wp.static(refractory):
-                after.held_ns[pixel] = state.held_ns
-            if wp.static(spontaneous):
-                after.next_ns[pixel] = state.next_ns
-                after.noise_count[pixel] = state.noise_count
-            if wp.static(stochastic):
-                after.voltage[pixel] = state.voltage
-            if invalid_count > 0:
-                pixel_count = base.shape[0]
-                flat = wp.int64(invalid_first) * wp.int64(pixel_count) + wp.int64(pixel)
-                wp.atomic_add(counters_out, 1, wp.int64(invalid_count))
-                wp.atomic_max(counters_out, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
+                after.reference[world, pixel] = state.reference
+            if wp.static("jitter" in terms):
+                after.event_count[world, pixel] = state.event_count
+            if wp.static("low_pass" in terms):
+                after.filtered[world, pixel] = filtered
+            if wp.static("light_leak" in terms):
+                after.exposure_ns[world, pixel] = exposure_ns
+            if wp.static("refractory" in terms):
+                after.held_ns[world, pixel] = state.held_ns
+            if wp.static("spontaneous" in terms):
+                after.next_ns[world, pixel] = state.next_ns
+                after.noise_count[world, pixel] = state.noise_count
+            if wp.static("stochastic" in terms):
+                after.voltage[world, pixel] = state.voltage
+            pixel_count = before.base.shape[1]
+            note_invalid(invalid_count, invalid_first, frame_count, pixel, pixel_count, stack.counters[slot])
 
-    return scan_pixel
+    @wp.kernel(
+        module=wp.get_module(f"{__name__}.{'_'.join(sorted(terms)) or 'ideal'}"), enable_backward=False
+    )
+    def scan(
+        # Model:
+        models: wp.array[PixelModel],
+        layout: KeyLayout,
+        # In:
+        extent: Extent,
+        before: PixelState,
+        # In/out:
+        stack: Stack,
+        # Out:
+        after: PixelState,
+    ):
+        index, thread = wp.tid()
+        world = extent.first_world + index
+        pixel = extent.first_pixel + thread
+        if extent.part != ALL and stack.overflow[world] == 0:
+            return
+        slot = extent.first_slot + world
+        keys = stack.keys[slot]
+        counters = stack.counters[slot]
+        write_key(OPEN, wp.int64(0), keys, counters)
+        if pixel < extent.end_pixel:
+            tabulate = extent.part == COUNT
+            scan_pixel(
+                models[world], layout, world, slot, pixel, extent.frame_count, tabulate, before, stack, after
+            )
+        write_key(CLOSE, wp.int64(0), keys, counters)
+
+    return scan

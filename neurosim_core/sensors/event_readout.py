@@ -14,15 +14,12 @@ last all the same. Without, a pixel does not wait. A refractory time begins at t
 Stamps may be late, by a normal number for each event that is at least 0.
 
 It is a sequence by its nature, so one thread of the CPU does it, also for a camera on a GPU, where one thread
-takes half a microsecond for each event: keys come sorted by time to the nanosecond, then row, column and
-polarity, and go back. What is read depends only on what has come before, so not on when it is asked for.
+takes half a microsecond for each event: keys come, in the order of time to the nanosecond, then row, column
+and polarity, and go back. What is read depends only on what has come before, so not on when it is asked for.
 
 Reference: Boahen (2000), Point-to-point connectivity between neuromorphic chips using address events, for
 arbitrated queues; Finateu et al. (2020) for a readout by rows.
 """
-
-from collections import deque
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -30,9 +27,8 @@ from numpy.typing import NDArray
 
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.random import normal2, random_bits, stream_id
-from neurosim_core.runtime.cuda import Fence
 from neurosim_core.sensors.event_config import ReadoutConfig
-from neurosim_core.sensors.event_levels import SUB_BITS
+from neurosim_core.sensors.event_levels import SUB_BITS, KeyLayout
 from neurosim_core.sensors.event_noise import mix_seed
 
 wp.set_module_options({"enable_backward": False})
@@ -65,13 +61,11 @@ class _Bus:
     event_ticks: wp.int64
     row_ticks: wp.int64
     queue_length: wp.int32
-    row_shift: wp.int32
-    time_shift: wp.int32
+    layout: KeyLayout
     latency_ticks: wp.float64
     jitter_ticks: wp.float64
     seed: wp.uint64
     stream: wp.uint32
-    pixel_shift: wp.int32
     free: wp.array[wp.int64]  # When the bus is free, shape [1]
     ready: wp.array[wp.int64]
     """With a handshake: when the event of a pixel is read, shape [pixel]; else empty."""
@@ -110,43 +104,25 @@ def _in_reset(bus: _Bus, came: wp.int64, place: wp.int64) -> wp.bool:
     """Return whether the pixel of an event still waits for another to be read."""
     if bus.ready.shape[0] == 0:
         return False
-    return came < bus.ready[wp.int32(place >> wp.int64(bus.pixel_shift))]
+    return came < bus.ready[wp.int32(place >> wp.int64(bus.layout.column_shift))]
 
 
 @wp.func
 def _set_ready(bus: _Bus, ticks: wp.int64, place: wp.int64) -> None:
     if bus.ready.shape[0] > 0:
-        bus.ready[wp.int32(place >> wp.int64(bus.pixel_shift))] = ticks
-
-
-@wp.kernel
-def _by_nanosecond(
-    # In:
-    keys: wp.array[wp.int64],
-    first: wp.int32,
-    time_shift: wp.int32,
-    # Out:
-    keys_out: wp.array[wp.int64],
-) -> None:
-    """Write keys that sort by the nanosecond: time [us] | nanoseconds | row | col | polarity."""
-    event = wp.tid()
-    key = keys[first + event]
-    low_bits = (_ONE << wp.int64(time_shift - 1)) - _ONE  # without `late`
-    place = (key & low_bits) >> _SUB_SHIFT
-    time = (key >> wp.int64(time_shift)) << wp.int64(time_shift)
-    keys_out[event] = time | ((key & _SUB_MASK) << (wp.int64(time_shift - 1) - _SUB_SHIFT)) | place
+        bus.ready[wp.int32(place >> wp.int64(bus.layout.column_shift))] = ticks
 
 
 @wp.func
 def _arrival_ns(key: wp.int64, time_shift: wp.int32) -> wp.int64:
-    """Return the time of a key of `_by_nanosecond`, from the keys' origin."""
+    """Return the time of a key of `by_nanosecond`, from the keys' origin."""
     sub_ns = (key >> (wp.int64(time_shift - 1) - _SUB_SHIFT)) & _SUB_MASK
     return (key >> wp.int64(time_shift)) * _US + sub_ns
 
 
 @wp.func
 def _place(key: wp.int64, time_shift: wp.int32) -> wp.int64:
-    """Return row, column and polarity of a key of `_by_nanosecond`, where a key of an event has them."""
+    """Return row, column and polarity of a key of `by_nanosecond`, where a key of an event has them."""
     mask = (_ONE << (wp.int64(time_shift - 1) - _SUB_SHIFT)) - _ONE
     return (key & mask) << _SUB_SHIFT
 
@@ -159,7 +135,6 @@ def _read_events(
     arrivals: wp.array[wp.int64],
     count: wp.int32,
     origin_ns: wp.int64,
-    first_out: wp.int32,
     # Out:
     keys_out: wp.array[wp.int64],
     dropped_ns_out: wp.array[wp.int64],
@@ -167,20 +142,20 @@ def _read_events(
 ) -> None:
     """Read events one by one; the time at which each will be read is known when it comes.
 
-    `arrivals` are sorted keys of `_by_nanosecond`, with their origin from the reset [ns]; what is read goes
-    to `keys_out` from `first_out` on; of lost events the time from the keys' origin is noted [ns].
+    `arrivals` are keys of `by_nanosecond`, with their origin from the reset [ns]; of lost events the time is
+    noted, from the keys' origin [ns].
     """
     free = bus.free[0]
     read = wp.int32(0)
     dropped = wp.int32(0)
     for event in range(count):
         key = arrivals[event]
-        arrival_ns = _arrival_ns(key, bus.time_shift)
+        arrival_ns = _arrival_ns(key, bus.layout.time_shift)
         came = (arrival_ns + origin_ns) << _TICK_BITS
         waiting = wp.int64(0)
         if free > came:  # those that begin later, one every event_ticks, the last at free - event_ticks
             waiting = (free - came + bus.event_ticks - _ONE) // bus.event_ticks - _ONE
-        place = _place(key, bus.time_shift)
+        place = _place(key, bus.layout.time_shift)
         if waiting >= wp.int64(bus.queue_length) or _in_reset(bus, came, place):
             dropped_ns_out[dropped] = arrival_ns
             dropped += 1
@@ -188,9 +163,7 @@ def _read_events(
             begin = wp.max(free, came)
             free = begin + bus.event_ticks
             _set_ready(bus, begin, place)
-            keys_out[first_out + read] = _key_at(
-                _stamped(bus, begin, place), origin_ns, place, bus.time_shift
-            )
+            keys_out[read] = _key_at(_stamped(bus, begin, place), origin_ns, place, bus.layout.time_shift)
             read += 1
     bus.free[0] = free
     counters[_READ] = read
@@ -202,7 +175,6 @@ def _serve(
     bus: _Bus,
     before: wp.int64,
     origin_ns: wp.int64,
-    first_out: wp.int32,
     keys_out: wp.array[wp.int64],
     counters: wp.array[wp.int32],
 ) -> None:
@@ -216,7 +188,7 @@ def _serve(
         count = wp.int32(0)
         while node >= 0:
             stamp = _stamped(bus, begin, bus.place[node])
-            keys_out[first_out + counters[_READ]] = _key_at(stamp, origin_ns, bus.place[node], bus.time_shift)
+            keys_out[counters[_READ]] = _key_at(stamp, origin_ns, bus.place[node], bus.layout.time_shift)
             _set_ready(bus, begin, bus.place[node])
             counters[_READ] = counters[_READ] + 1
             following = bus.following[node]
@@ -240,7 +212,6 @@ def _read_rows(
     count: wp.int32,
     origin_ns: wp.int64,
     now_ns: wp.int64,
-    first_out: wp.int32,
     # Out:
     keys_out: wp.array[wp.int64],
     dropped_ns_out: wp.array[wp.int64],
@@ -251,16 +222,16 @@ def _read_rows(
     counters[_DROPPED] = 0
     for event in range(count):
         key = arrivals[event]
-        arrival_ns = _arrival_ns(key, bus.time_shift)
+        arrival_ns = _arrival_ns(key, bus.layout.time_shift)
         came = (arrival_ns + origin_ns) << _TICK_BITS
-        _serve(bus, came, origin_ns, first_out, keys_out, counters)
-        place = _place(key, bus.time_shift)
+        _serve(bus, came, origin_ns, keys_out, counters)
+        place = _place(key, bus.layout.time_shift)
         if counters[_WAITING] >= bus.queue_length or _in_reset(bus, came, place):
             dropped_ns_out[counters[_DROPPED]] = arrival_ns
             counters[_DROPPED] = counters[_DROPPED] + 1
         else:
             _set_ready(bus, _WAITS, place)
-            row = wp.int32(place >> wp.int64(bus.row_shift))
+            row = wp.int32(place >> wp.int64(bus.layout.row_shift))
             node = counters[_FREE_NODE]
             counters[_FREE_NODE] = bus.following[node]
             counters[_WAITING] = counters[_WAITING] + 1
@@ -275,7 +246,15 @@ def _read_rows(
             else:
                 bus.following[bus.tail[row]] = node
             bus.tail[row] = node
-    _serve(bus, (now_ns << _TICK_BITS) + _ONE, origin_ns, first_out, keys_out, counters)
+    _serve(bus, (now_ns << _TICK_BITS) + _ONE, origin_ns, keys_out, counters)
+
+
+def by_nanosecond(keys: NDArray[np.int64], time_shift: int) -> NDArray[np.int64]:
+    """Return keys in the order of nanoseconds, as other bits: time [us] | ns | row | col | polarity."""
+    sub_shift = SUB_BITS - 1
+    place = (keys & ((1 << (time_shift - 1)) - 1)) >> sub_shift  # without `late`
+    time = (keys >> time_shift << time_shift) | ((keys & 1023) << (time_shift - 1 - sub_shift))
+    return np.sort(time | place)
 
 
 class Readout:
@@ -284,10 +263,7 @@ class Readout:
     Args:
         config: Its parameters.
         height: Rows of the sensor [px].
-        row_shift: Bits of a key below its row.
-        time_shift: Bits of a key below its microseconds.
-        pixel_shift: Bits of a key below its column, without what is not of the place of the pixel.
-        device: Where the keys are.
+        layout: Of the keys.
         seed: Seed of the run, for late stamps.
         sensor: Name of the camera, likewise.
 
@@ -300,28 +276,22 @@ class Readout:
         config: ReadoutConfig,
         *,
         height: int,
-        row_shift: int,
-        time_shift: int,
-        pixel_shift: int,
-        device: Any,
+        layout: KeyLayout,
         seed: int,
         sensor: str,
     ) -> None:
         self._rowwise = config.kind == "row"
-        self._device = wp.get_device(device)
-        self._time_shift = time_shift
+        self._layout = layout
         bus = _Bus()
+        bus.layout = layout
         bus.event_ticks = max(1, round(1e9 * _TICKS_PER_NS / config.bandwidth_hz))
         bus.row_ticks = round(config.row_s * 1e9 * _TICKS_PER_NS)
         bus.queue_length = config.queue_length
-        bus.row_shift = row_shift
-        bus.time_shift = time_shift
         bus.latency_ticks = config.latency_s * 1e9 * _TICKS_PER_NS
         bus.jitter_ticks = config.jitter_s * 1e9 * _TICKS_PER_NS
         self._seed, bus.stream = seed, stream_id(f"{sensor}/events/late")
-        bus.pixel_shift = pixel_shift
         bus.free = wp.zeros(1, dtype=wp.int64, device="cpu")
-        pixels = height << (row_shift - pixel_shift) if config.handshake else 0
+        pixels = height << (layout.row_shift - layout.column_shift) if config.handshake else 0
         bus.ready = wp.zeros(pixels, dtype=wp.int64, device="cpu")
         places = config.queue_length if self._rowwise else 0
         rows = height if self._rowwise else 0
@@ -331,12 +301,8 @@ class Readout:
         bus.head, bus.tail, bus.rows = (wp.empty(rows, dtype=wp.int32, device="cpu") for _ in range(3))
         self._bus = bus
         self._counters = wp.zeros(_COUNTERS, dtype=wp.int32, device="cpu")
-        self._arrived = Fence(self._device)
-        self._make_buffers(0)
         self._reset_ns = 0
-        self._dropped: deque[NDArray[np.int64]] = deque()
         self.waiting_count = 0
-        wp.load_module(_read_rows.module, device=self._device)
         wp.load_module(_read_rows.module, device="cpu")
 
     def reset(self, stamp_ns: int) -> None:
@@ -351,90 +317,28 @@ class Readout:
             following = self._bus.following.numpy()
             following[:] = np.arange(1, len(following) + 1)
             following[-1] = -1
-        self._dropped.clear()
         self.waiting_count = 0
 
     def read(
-        self,
-        keys: wp.array[wp.int64],
-        *,
-        first: int,
-        count: int,
-        spare: wp.array[wp.int64],
-        order: wp.array[wp.int32],
-        origin_us: int,
-        now_ns: int,
-    ) -> int:
-        """Replace the keys of events that have happened by those of events that are read; return how many.
+        self, keys: NDArray[np.int64], *, origin_us: int, now_ns: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the keys of events that are read, and when events that are lost had happened [ns].
 
         Args:
-            keys: Overwritten from `first` on; there has to be room for `count` + `waiting_count` keys.
-            first: Where the keys begin of events that have happened since the last call, in any order.
-            count: How many there are.
-            spare: Overwritten; has room for `count` keys, on CUDA for twice as many.
-            order: On CUDA overwritten, with room for twice `count`.
+            keys: Those of events that have happened since the last call, in any order.
             origin_us: Origin of the time of keys [us].
             now_ns: All events until then have happened [ns].
         """
-        wp.launch(
-            _by_nanosecond,
-            dim=count,
-            inputs=[keys, first, self._time_shift],
-            outputs=[spare],
-            device=self._device,
-        )
-        self._sort(spare, order, count)
-        arrivals, out, first_out = self._on_cpu(spare, keys, first, count)
+        count, origin_ns = len(keys), origin_us * NS_PER_US
+        read, lost_ns = np.empty(count + self.waiting_count, np.int64), np.empty(count, np.int64)
         now = [now_ns - self._reset_ns] if self._rowwise else []
+        arrivals = by_nanosecond(keys, self._layout.time_shift)
         wp.launch(
             _read_rows if self._rowwise else _read_events,
             dim=1,
-            inputs=[self._bus, arrivals, count, origin_us * NS_PER_US - self._reset_ns, *now, first_out],
-            outputs=[out, self._dropped_ns, self._counters],
+            inputs=[self._bus, arrivals, count, origin_ns - self._reset_ns, *now],
+            outputs=[read, lost_ns, self._counters],
             device="cpu",
         )
-        read, self.waiting_count, dropped = (int(n) for n in self._counters.numpy()[:3])
-        if out is not keys and read > 0:
-            wp.copy(keys, out, dest_offset=first, count=read)
-        if dropped > 0:
-            self._dropped.append(self._dropped_ns.numpy()[:dropped] + origin_us * NS_PER_US)
-        return read
-
-    def take_dropped(self, until_ns: int) -> int:
-        """Return how many events were lost until a time [ns], since the one before."""
-        count = 0
-        while self._dropped and self._dropped[0][0] <= until_ns:
-            stamps = self._dropped.popleft()
-            lost = int(np.searchsorted(stamps, until_ns, side="right"))
-            count += lost
-            if lost < len(stamps):
-                self._dropped.appendleft(stamps[lost:])
-                break
-        return count
-
-    def _make_buffers(self, size: int) -> None:
-        """Allocate for so many events at a time; keys are only copied where they are on a GPU."""
-        copied = size if self._device.is_cuda else 0
-        self._dropped_ns = wp.empty(size, dtype=wp.int64, device="cpu")
-        self._keys_in, self._keys_out = (
-            wp.empty(copied, dtype=wp.int64, device="cpu", pinned=copied > 0) for _ in range(2)
-        )
-
-    def _on_cpu(self, arrivals: Any, keys: Any, first: int, count: int) -> tuple[Any, Any, int]:
-        """Return where the CPU finds arrivals and puts keys, and the place of the first of these."""
-        room = count + self.waiting_count
-        if room > self._dropped_ns.shape[0]:
-            self._make_buffers(1 << (room - 1).bit_length())
-        if self._device.is_cpu:
-            return arrivals, keys, first
-        if count > 0:
-            wp.copy(self._keys_in, arrivals, count=count)
-        self._arrived.set()
-        self._arrived.wait()
-        return self._keys_in, self._keys_out, 0
-
-    def _sort(self, keys: Any, order: Any, count: int) -> None:
-        if self._device.is_cpu:
-            keys.numpy()[:count].sort()
-        elif count > 0:
-            wp.utils.radix_sort_pairs(keys, order, count)
+        read_count, self.waiting_count, lost_count = (int(n) for n in self._counters.numpy()[:3])
+        return read[:read_count], lost_ns[:lost_count] + origin_ns

@@ -1,20 +1,24 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,empty-body,assignment"
-"""The scan of an ideal pixel over a stack of frames, which writes the keys of its events.
+"""The scan of ideal pixels over a stack of frames, which writes the keys of their events.
 
-What a pixel does with its samples is in `scan_pixel`, once; levels, the tie rule and keys are in
-`event_levels`. Between stacks a pixel holds its last sample and how many levels it has crossed. The kernels
-are in `event_kernels`.
+Levels, the tie rule and keys are in `event_levels`. Between stacks a pixel holds its last sample and how many
+levels it has crossed. Pixels that are not ideal have a scan of their own, made to measure, in
+`event_noise_scan`; a scan of single frames on CUDA is in `event_frame_scan`.
 
-Pixels that are not ideal have a scan of their own, made to measure, in `event_noise_scan`.
+Every world has keys and counters of its own, and no block of threads takes pixels of two, so a block finds
+room for its events in its world with one atomic operation. Nothing here depends on other worlds.
 """
 
 import warp as wp
 
 from neurosim_core.native_code import read_native
 from neurosim_core.sensors.event_levels import (
+    KeyLayout,
     fall,
     key_of_level,
+    levels_from,
     place_of,
+    quiet_range,
     reach_down,
     reach_up,
     rise,
@@ -24,7 +28,7 @@ wp.set_module_options({"enable_backward": False})
 
 BLOCK_SIZE = wp.constant(256)
 """Threads of a block on CUDA."""
-SINGLY = wp.constant(wp.int32(4))
+STEPS_MAX = wp.constant(wp.int32(4))
 """Levels that are found one by one; few samples cross more, and theirs are found at once."""
 LOG_RADIANCE_MAX = 1.0e3
 """Larger magnitudes are refused like non-finite values: exp(1000) is no radiance."""
@@ -35,6 +39,68 @@ PUT = wp.constant(1)
 CLOSE = wp.constant(2)
 READ = wp.constant(3)
 START = wp.constant(4)
+
+ALL = wp.constant(0)
+COUNT = wp.constant(1)
+AGAIN = wp.constant(2)
+"""What a scan is for: all worlds; those with too many events, to count these by row; the same with fewer
+rows."""
+
+TILE_SIZE = wp.constant(256)
+"""Pixels that a thread of `screen` takes."""
+
+
+@wp.struct
+class Stack:
+    """What the pixels of one camera see in a step, and what comes of it. Shapes begin with [world]."""
+
+    log_radiance: wp.array3d[wp.float32]  # [world, frame, pixel]
+    stamps: wp.array2d[wp.int64]  # Of the state and of each frame, from the origin [ns], [world, frame + 1]
+    origin_us: wp.array[wp.int64]  # Origin of the keys' time since the reset of the world [us]
+    since_reset_ns: wp.array[wp.int64]
+    """The same from the reset of the pixels on, which noise counts from [ns]."""
+    row_limit: wp.array2d[wp.int32]  # Rows whose events are kept, [world, frame]
+    overflow: wp.array[wp.int32]  # 1: the world has more events than fit
+    table: wp.array3d[wp.int32]  # Events of the worlds that have too many, [world, frame, row]; zeros before
+    keys: wp.array2d[wp.int64]
+    """Shape [slot, capacity]; slots are worlds, or parts of the pixels of a single world."""
+    counters: wp.array2d[wp.int64]
+    """Shape [slot, >= 3], zeros before: where the next key goes, which counts events kept (written or not);
+    invalid samples; and the flat index of the first of these in the stack, as frame_count * pixel_count minus
+    it."""
+    dropped: wp.array[wp.int32]  # Events that were lost in the step
+
+
+@wp.struct
+class PixelState:
+    """The state of pixels between two stacks, shape [world, pixel]; of what no term has, [world, 0]."""
+
+    base: wp.array2d[wp.float32]  # Log radiance of the reset
+    last: wp.array2d[wp.float32]  # Last sample
+    crossed: wp.array2d[wp.vec2i]  # Levels crossed upwards and downwards
+    # Of pixels that are not ideal:
+    reference: wp.array2d[wp.float64]
+    """What `base` is to an ideal pixel; changes at resets (refractory, spontaneous) and events (jitter)."""
+    event_count: wp.array2d[wp.int32]  # Events since the reset, which number the draws of thresholds
+    filtered: wp.array2d[wp.float64]  # Output of the photoreceptor
+    exposure_ns: wp.array2d[wp.float64]  # Light since the reset, in units of white, times time
+    held_ns: wp.array2d[wp.float64]  # Time in reset that is left; negative: not in reset
+    next_ns: wp.array2d[wp.int64]  # Time of the next noise event that may be, since the reset
+    noise_count: wp.array2d[wp.int32]  # Its number
+    voltage: wp.array2d[wp.float64]  # Of the Brownian motion, in thresholds
+
+
+@wp.struct
+class Extent:
+    """What a launch scans, and what for."""
+
+    first_world: wp.int32
+    world_count: wp.int32
+    first_pixel: wp.int32
+    first_slot: wp.int32  # Of the keys and counters of the first world of all
+    end_pixel: wp.int32  # Threads at or past it, which fill the last block on CUDA, have no pixel
+    frame_count: wp.int32
+    part: wp.int32  # ALL, COUNT or AGAIN
 
 
 @wp.func_native(read_native(__file__, "write_key"))
@@ -88,8 +154,8 @@ def _end_of_round(first: wp.int32, frame_count: wp.int32) -> wp.int32:
     ...
 
 
-@wp.func_native(read_native(__file__, "next_loud"))
-def _next_loud(
+@wp.func_native(read_native(__file__, "next_active_frame"))
+def _next_active_frame(
     log_radiance: wp.array2d[wp.float32],
     pixel: wp.int32,
     first: wp.int32,
@@ -101,95 +167,152 @@ def _next_loud(
     ...
 
 
-@wp.func_native(read_native(__file__, "call_up"))
-def call_up(log_radiance: wp.array2d[wp.float32], pixel: wp.int32, frame_count: wp.int32) -> None:
+@wp.func_native(read_native(__file__, "prefetch_samples"))
+def prefetch_samples(log_radiance: wp.array2d[wp.float32], pixel: wp.int32, frame_count: wp.int32) -> None:
     """Have the samples of a pixel come near, on CUDA, before they are read one after the other."""
     ...
+
+
+@wp.func_native(read_native(__file__, "count_quiet_frames"))
+def _count_quiet_frames(
+    begin: wp.int32,
+    end: wp.int32,
+    log_radiance: wp.array2d[wp.float32],
+    frame_count: wp.int32,
+    low_32: wp.array[wp.float32],
+    high_32: wp.array[wp.float32],
+    quiet_count_out: wp.array[wp.int32],
+) -> None:
+    """Count for at most 256 pixels the frames before the first that leaves (low, high)."""
+    ...
+
+
+@wp.func
+def note_invalid(
+    count: wp.int32,
+    first_frame: wp.int32,
+    frame_count: wp.int32,
+    pixel: wp.int32,
+    pixel_count: wp.int32,
+    counters: wp.array[wp.int64],
+) -> None:
+    """Count the samples of a pixel that cannot be used, and keep where the first of all is; see `Stack`."""
+    if count > 0:
+        flat = wp.int64(first_frame) * wp.int64(pixel_count) + wp.int64(pixel)
+        wp.atomic_add(counters, 1, wp.int64(count))
+        wp.atomic_max(counters, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
+
+
+@wp.kernel
+def screen(
+    # Model:
+    thresholds: wp.array[wp.vec2d],
+    # In:
+    extent: Extent,
+    stack: Stack,
+    before: PixelState,
+    # Out:
+    low_out: wp.array2d[wp.float32],
+    high_out: wp.array2d[wp.float32],
+    quiet_count_out: wp.array2d[wp.int32],
+) -> None:
+    """Count the frames of each pixel before the first that may fire; threads are [world, tile].
+
+    This is what makes the scan fast on a CPU: a pixel's own samples lie far apart in memory. It changes no
+    event. The quiet range of each pixel is left in `low_out` and `high_out`.
+    """
+    index, tile = wp.tid()
+    world = extent.first_world + index
+    begin = extent.first_pixel + tile * TILE_SIZE
+    end = wp.min(begin + TILE_SIZE, extent.end_pixel)
+    on = thresholds[world][0]
+    off = thresholds[world][1]
+    for pixel in range(begin, end):
+        crossed = before.crossed[world, pixel]
+        levels = levels_from(wp.float64(before.base[world, pixel]), on, off)
+        quiet = quiet_range(levels, crossed[0], crossed[1])
+        low_out[world, pixel] = quiet[0]
+        high_out[world, pixel] = quiet[1]
+    _count_quiet_frames(
+        begin,
+        end,
+        stack.log_radiance[world],
+        extent.frame_count,
+        low_out[world],
+        high_out[world],
+        quiet_count_out[world],
+    )
 
 
 @wp.func
 def _write_kept(
     index: wp.int32,
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
-    width: wp.int32,
-    row_shift: wp.int32,
-    time_shift: wp.int32,
     first_pixel: wp.int32,
     first_frame: wp.int32,
-    log_radiance: wp.array2d[wp.float32],
-    stamps: wp.array[wp.int64],
-    base: wp.array[wp.float32],
-    keys_out: wp.array[wp.int64],
-    counters_out: wp.array[wp.int64],
+    world: wp.int32,
+    slot: wp.int32,
+    thresholds: wp.vec2d,
+    layout: KeyLayout,
+    base: wp.array2d[wp.float32],
+    stack: Stack,
 ) -> None:
     """Write the keys of what a pixel of the block has crossed in a frame, as far as there is room."""
-    word = _read_word(0, index, counters_out)
+    counters = stack.counters[slot]
+    word = _read_word(0, index, counters)
     pixel = first_pixel + (word & 255)
     frame = first_frame + (word >> 8)
-    last = wp.cast(_read_word(1, index, counters_out), wp.float32)
-    up = _read_word(2, index, counters_out)
-    down = _read_word(3, index, counters_out)
-    offset = wp.int64(_read_word(4, index, counters_out)) & wp.int64(0xFFFFFFFF)
-    slot = keep_crossing(START, 0, 0, wp.float32(0.0), 0, 0, 0, 0, counters_out) + offset
-    sample = log_radiance[frame, pixel]
-    level_0 = wp.float64(base[pixel])
-    place = place_of(pixel, pixel // width, width, row_shift)
-    for event in range(_read_word(5, index, counters_out)):
-        if slot + wp.int64(event) < wp.int64(keys_out.shape[0]):
-            keys_out[wp.int32(slot) + event] = key_of_level(
-                event,
-                level_0,
-                up,
-                down,
-                threshold_on,
-                threshold_off,
-                last,
-                sample,
-                stamps[frame],
-                stamps[frame + 1],
-                place,
-                time_shift,
+    last = wp.cast(_read_word(1, index, counters), wp.float32)
+    up = _read_word(2, index, counters)
+    down = _read_word(3, index, counters)
+    offset = wp.int64(_read_word(4, index, counters)) & wp.int64(0xFFFFFFFF)
+    place_of_first = keep_crossing(START, 0, 0, wp.float32(0.0), 0, 0, 0, 0, counters) + offset
+    sample = stack.log_radiance[world, frame, pixel]
+    levels = levels_from(wp.float64(base[world, pixel]), thresholds[0], thresholds[1])
+    place = place_of(pixel, pixel // layout.width, layout)
+    start_ns = stack.stamps[world, frame]
+    end_ns = stack.stamps[world, frame + 1]
+    for event in range(_read_word(5, index, counters)):
+        if place_of_first + wp.int64(event) < wp.int64(stack.keys.shape[1]):
+            stack.keys[slot, wp.int32(place_of_first) + event] = key_of_level(
+                event, levels, up, down, last, sample, start_ns, end_ns, place, layout.time_shift
             )
 
 
-@wp.func
-def scan_pixel(
-    threshold_on: wp.float64,
-    threshold_off: wp.float64,
-    width: wp.int32,
-    row_shift: wp.int32,
-    time_shift: wp.int32,
-    pixel: wp.int32,
-    end_pixel: wp.int32,
-    lane: wp.int32,
-    log_radiance: wp.array2d[wp.float32],
-    stamps: wp.array[wp.int64],
-    frame_count: wp.int32,
-    lead: wp.array[wp.int32],
-    row_limit: wp.array[wp.int32],
-    base: wp.array[wp.float32],
-    last: wp.array[wp.float32],
-    crossed: wp.array[wp.vec2i],
-    tabulate: wp.bool,
-    last_out: wp.array[wp.float32],
-    crossed_out: wp.array[wp.vec2i],
-    keys_out: wp.array[wp.int64],
-    counters_out: wp.array[wp.int64],
-    table_out: wp.array2d[wp.int32],
+@wp.kernel(launch_bounds=(BLOCK_SIZE, 4))  # blocks of a multiprocessor: fastest on an H200
+def scan(
+    # Model:
+    thresholds: wp.array[wp.vec2d],
+    layout: KeyLayout,
+    # In:
+    extent: Extent,
+    quiet_count: wp.array2d[wp.int32],
+    before: PixelState,
+    # In/out:
+    stack: Stack,
+    # Out:
+    after: PixelState,
 ) -> None:
-    """Take one pixel from its state before a stack to that after it.
+    """Take ideal pixels over the frames of a step; threads are [world, pixel], whole blocks to a world.
 
-    All threads of a block come here together, also those whose pixel is past the end; `lane` is the number of
-    the thread in it. Shapes: frames [frame, pixel], contiguous; stamps [frame + 1], of the state and of each
-    frame, from the origin [ns]; `lead`, the frames at the start that are known to be quiet, and the states of
-    pixels [pixel]; `row_limit`, the rows whose events are kept [frame]. With `tabulate` events are only
-    counted, in a table [frame, row] of zeros. Counters: where the next key goes, which counts events kept
-    (written or not); invalid samples; and the flat index of the first of these in the stack, as frame_count *
-    pixel_count minus it: zero both before.
+    All threads of a block come to what they do together. `quiet_count` is the number of frames at the start
+    that are known to be quiet, shape [world, pixel]. With the part COUNT events are only counted, in the
+    table of the stack.
     """
-    alive = pixel < end_pixel
-    base_32 = wp.float32(0.0)
+    index, thread = wp.tid()
+    world = extent.first_world + index
+    if extent.part != ALL and stack.overflow[world] == 0:
+        return
+    tabulate = extent.part == COUNT
+    pixel = extent.first_pixel + thread
+    lane = thread % BLOCK_SIZE
+    alive = pixel < extent.end_pixel
+    frame_count = extent.frame_count
+    log_radiance = stack.log_radiance[world]
+    stamps = stack.stamps[world]
+    slot = extent.first_slot + world
+    counters = stack.counters[slot]
+    keys = stack.keys[slot]
+    levels = levels_from(wp.float64(0.0), thresholds[world][0], thresholds[world][1])
     row = wp.int32(0)
     up = wp.int32(0)
     down = wp.int32(0)
@@ -201,92 +324,77 @@ def scan_pixel(
     invalid_count = wp.int32(0)
     invalid_first = wp.int32(0)
     if alive:
-        before = crossed[pixel]
-        up = before[0]
-        down = before[1]
-        frame = lead[pixel]
+        crossed = before.crossed[world, pixel]
+        up = crossed[0]
+        down = crossed[1]
+        frame = quiet_count[world, pixel]
         if frame < frame_count:
-            base_32 = base[pixel]
-            sample_before = last[pixel]
-            row = pixel // width
-            low = reach_down(wp.float64(base_32), up, down, threshold_on, threshold_off)
-            high = reach_up(wp.float64(base_32), up, down, threshold_on, threshold_off)
+            levels.base = wp.float64(before.base[world, pixel])
+            sample_before = before.last[world, pixel]
+            row = pixel // layout.width
+            low = reach_down(levels, up, down)
+            high = reach_up(levels, up, down)
 
     begin = wp.int32(0)
     while begin < frame_count:
         end = _end_of_round(begin, frame_count)
-        keep_crossing(OPEN, 0, 0, wp.float32(0.0), 0, 0, 0, 0, counters_out)
+        keep_crossing(OPEN, 0, 0, wp.float32(0.0), 0, 0, 0, 0, counters)
         if alive:
-            frame = _next_loud(log_radiance, pixel, wp.max(frame, begin), end, low, high)
+            frame = _next_active_frame(log_radiance, pixel, wp.max(frame, begin), end, low, high)
             while frame < end:
                 if frame > seen:
                     sample_before = log_radiance[frame - 1, pixel]
                 sample = log_radiance[frame, pixel]
                 if wp.abs(sample) <= LIMIT:
-                    level_0 = wp.float64(base_32)
                     up_before = up
                     down_before = down
                     turn = wp.int32(0)
-                    while turn <= SINGLY and (sample >= high or sample <= low):
-                        if turn == SINGLY and sample >= high:
-                            up = rise(sample, level_0, up, down, threshold_on, threshold_off)
-                        elif turn == SINGLY:
-                            down = fall(sample, level_0, up, down, threshold_on, threshold_off)
+                    while turn <= STEPS_MAX and (sample >= high or sample <= low):
+                        if turn == STEPS_MAX and sample >= high:
+                            up = rise(sample, levels, up, down)
+                        elif turn == STEPS_MAX:
+                            down = fall(sample, levels, up, down)
                         elif sample >= high:
                             up += 1
                         else:
                             down += 1
-                        low = reach_down(level_0, up, down, threshold_on, threshold_off)
-                        high = reach_up(level_0, up, down, threshold_on, threshold_off)
+                        low = reach_down(levels, up, down)
+                        high = reach_up(levels, up, down)
                         turn += 1
                     found = up - up_before + down - down_before
                     if tabulate:
-                        wp.atomic_add(table_out, frame, row, found)
-                    elif row < row_limit[frame]:
+                        wp.atomic_add(stack.table, world, frame, row, found)
+                    elif row < stack.row_limit[world, frame]:
                         kept = keep_crossing(
-                            PUT, frame, found, sample_before, up_before, down_before, 0, 0, counters_out
+                            PUT, frame, found, sample_before, up_before, down_before, 0, 0, counters
                         )
                         if kept == wp.int64(0):
-                            place = place_of(pixel, row, width, row_shift)
+                            place = place_of(pixel, row, layout)
                             for event in range(found):
                                 key = key_of_level(
                                     event,
-                                    level_0,
+                                    levels,
                                     up_before,
                                     down_before,
-                                    threshold_on,
-                                    threshold_off,
                                     sample_before,
                                     sample,
                                     stamps[frame],
                                     stamps[frame + 1],
                                     place,
-                                    time_shift,
+                                    layout.time_shift,
                                 )
-                                _append(key, keys_out, counters_out)
+                                _append(key, keys, counters)
                     sample_before = sample
                 else:
                     if invalid_count == 0:
                         invalid_first = frame
                     invalid_count += 1
                 seen = frame + 1
-                frame = _next_loud(log_radiance, pixel, seen, end, low, high)
-        kept_count = wp.int32(keep_crossing(CLOSE, 0, 0, wp.float32(0.0), 0, 0, 0, 0, counters_out))
-        for index in range(lane, kept_count, BLOCK_SIZE):
+                frame = _next_active_frame(log_radiance, pixel, seen, end, low, high)
+        kept_count = wp.int32(keep_crossing(CLOSE, 0, 0, wp.float32(0.0), 0, 0, 0, 0, counters))
+        for kept_index in range(lane, kept_count, BLOCK_SIZE):
             _write_kept(
-                index,
-                threshold_on,
-                threshold_off,
-                width,
-                row_shift,
-                time_shift,
-                pixel - lane,
-                begin,
-                log_radiance,
-                stamps,
-                base,
-                keys_out,
-                counters_out,
+                kept_index, pixel - lane, begin, world, slot, thresholds[world], layout, before.base, stack
             )
         if alive and seen < end:
             sample_before = log_radiance[end - 1, pixel]
@@ -294,10 +402,6 @@ def scan_pixel(
         begin = end
 
     if alive and not tabulate:
-        last_out[pixel] = sample_before
-        crossed_out[pixel] = wp.vec2i(up, down)
-        if invalid_count > 0:
-            pixel_count = base.shape[0]
-            flat = wp.int64(invalid_first) * wp.int64(pixel_count) + wp.int64(pixel)
-            wp.atomic_add(counters_out, 1, wp.int64(invalid_count))
-            wp.atomic_max(counters_out, 2, wp.int64(frame_count) * wp.int64(pixel_count) - flat)
+        after.last[world, pixel] = sample_before
+        after.crossed[world, pixel] = wp.vec2i(up, down)
+        note_invalid(invalid_count, invalid_first, frame_count, pixel, before.base.shape[1], counters)

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,12 +13,11 @@ import numpy as np
 import warp as wp
 
 from neurosim_core.render.launch import core_count, share
-from neurosim_core.sensors import event_kernels as scan
+from neurosim_core.sensors import event_kernels
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_frame_scan import PIXELS_PER_THREAD, scan_frame
-from neurosim_core.sensors.event_noise_model import terms_of
-from neurosim_core.sensors.event_scan import BLOCK_SIZE
-from neurosim_core.sensors.event_states import PixelStates
+from neurosim_core.sensors.event_pixels import PixelStates, make_stack
+from neurosim_core.sensors.event_scan import AGAIN, ALL, BLOCK_SIZE, COUNT
 
 _SORT_BLOCK_SIZE = 1024
 """Threads that sort the events of a world, where there may be many."""
@@ -82,7 +82,7 @@ class WorldEventCamera:
         sensor: Name of the sensor: noise depends on it.
         seeds: Seed of each world.
         ordered: Sort the events of each world.
-        takes_apart: Have room for `results`; False: somebody else reads the keys.
+        decodes: Have room for `results`; False: somebody else reads the keys.
     """
 
     def __init__(
@@ -96,17 +96,15 @@ class WorldEventCamera:
         sensor: str,
         seeds: Sequence[int],
         ordered: bool = True,
-        takes_apart: bool = True,
+        decodes: bool = True,
     ) -> None:
         self.device: Any = wp.get_device(frames.device)
         world_count, frame_count, pixel_count = frames.shape
-        self._width, self._height = width, height
         self._ordered = ordered
-        self._capacity = capacity
         self._event_count_max: Any = wp.array(
             [config.event_count_max for config in configs], dtype=wp.int32, device=self.device
         )
-        terms = tuple(sorted({term for config in configs for term in terms_of(config)}))
+        terms = tuple(sorted({term for config in configs for term in config.terms()}))
         self._states = PixelStates(
             configs,
             width=width,
@@ -120,13 +118,16 @@ class WorldEventCamera:
         self.terms: tuple[str, ...] = terms
         """What is computed beyond ideal pixels in some world: some of `event_noise_model.TERMS`."""
         self.seed = self._states.seed
-        self.row_shift, self.time_shift = self._states.row_shift, self._states.time_shift
+        self.layout = self._states.layout
         self._shape = (world_count, pixel_count)
-        self.stack: Any = self._make_stack(frames, frame_count)
+        self.stack = make_stack(world_count, frame_count, height, self.device)
         """What a step sees and what comes of it, `event_kernels.Stack`."""
-        self._sections = self._zeros(-(-world_count // int(scan.SECTION)), wp.int64)
-        self._offsets_ns: dict[tuple[int, ...], Any] = {}
-        room = world_count * capacity if takes_apart else 0
+        self.stack.log_radiance = frames
+        self.grow(capacity)
+        self._sections = self._zeros(-(-world_count // int(event_kernels.SECTION)), wp.int64)
+        self.offsets = functools.lru_cache(_OFFSETS_MAX)(self._upload_offsets)
+        """Returns offsets of a step on the device; see `WorldFrameSensor.offsets`."""
+        room = world_count * capacity if decodes else 0
         self.results = WorldEvents(
             t=self._empty(room, wp.int64),
             x=self._empty(room, wp.uint16),
@@ -151,23 +152,16 @@ class WorldEventCamera:
             array.zero_()
         states = self._states
         wp.launch(
-            scan.begin_pixels,
+            event_kernels.begin_pixels,
             dim=self._shape,
             inputs=[mask, self.stack.log_radiance],
-            outputs=[states.base, states.last[parity], states.crossed[parity], self.stack.counters],
+            outputs=[states.ring[parity], self.stack.counters],
             device=self.device,
         )
         states.begin_noise(mask, parity)
 
-    def offsets(self, offsets_ns: tuple[int, ...]) -> Any:
-        """Return offsets of a pattern on the device; whoever makes a graph with them keeps them."""
-        if offsets_ns not in self._offsets_ns:
-            if len(self._offsets_ns) >= _OFFSETS_MAX:
-                self._offsets_ns.clear()
-            self._offsets_ns[offsets_ns] = wp.array(
-                np.array(offsets_ns, dtype=np.int64), dtype=wp.int64, device=self.device
-            )
-        return self._offsets_ns[offsets_ns]
+    def _upload_offsets(self, offsets_ns: tuple[int, ...]) -> Any:
+        return wp.array(np.array(offsets_ns, dtype=np.int64), dtype=wp.int64, device=self.device)
 
     def find(self, clock_ns: wp.array[wp.int64], offsets_ns: tuple[int, ...], parity: int) -> None:
         """Find the events of a step; launches only, on CUDA; see `WorldFrameSensor.find`.
@@ -177,7 +171,7 @@ class WorldEventCamera:
         """
         frame_count = len(offsets_ns) - 1
         offsets = self.offsets(offsets_ns)
-        self._launch(scan.begin_step, self._shape[0], [clock_ns, offsets], [self.stack])
+        self._launch(event_kernels.begin_step, self._shape[0], [clock_ns, offsets], [self.stack])
         if frame_count > 0:
             self.find_keys(frame_count, parity)
         self._hand_out()
@@ -185,13 +179,15 @@ class WorldEventCamera:
     def find_keys(self, frame_count: int, parity: int) -> None:
         """Scan the frames of a step that has begun, and drop the events that do not fit."""
         world_count = self._shape[0]
-        self.take_frames(frame_count, scan.ALL, parity)
-        self._launch(scan.find_overflow, world_count, [self._capacity, self._event_count_max], [self.stack])
+        self.take_frames(frame_count, ALL, parity)
+        self._launch(
+            event_kernels.find_overflow, world_count, [self._capacity, self._event_count_max], [self.stack]
+        )
         if self.device.is_cuda or self.stack.overflow.numpy().any():
-            self.take_frames(frame_count, scan.COUNT, parity)
+            self.take_frames(frame_count, COUNT, parity)
             each = self._capacity // frame_count
-            self._launch(scan.limit_rows, world_count, [each, self._event_count_max], [self.stack])
-            self.take_frames(frame_count, scan.AGAIN, parity)
+            self._launch(event_kernels.limit_rows, world_count, [each, self._event_count_max], [self.stack])
+            self.take_frames(frame_count, AGAIN, parity)
 
     def grow(self, capacity: int) -> None:
         """Have room for more keys; those there are are lost."""
@@ -204,13 +200,14 @@ class WorldEventCamera:
         if self._ordered:
             self._sort()
         counters, sections = self.stack.counters, self._sections
-        self._launch(scan.add_up_sections, sections.shape[0], [counters], [sections])
-        self._launch(scan.add_up, world_count + 1, [counters, sections], [events.offsets, events.counts])
+        self._launch(event_kernels.add_up_sections, sections.shape[0], [counters], [sections])
+        begun = [events.offsets, events.counts]
+        self._launch(event_kernels.add_up, world_count + 1, [counters, sections], begun)
         wp.launch(
-            scan.decode,
+            event_kernels.decode,
             dim=(world_count, lanes),
             block_dim=BLOCK_SIZE,
-            inputs=[self.row_shift, self.time_shift, lanes, 0, self.stack, events.offsets],
+            inputs=[self.layout, lanes, 0, self.stack, events.offsets],
             outputs=[events.t, events.x, events.y, events.polarity],
             device=self.device,
         )
@@ -220,7 +217,7 @@ class WorldEventCamera:
         if self.device.is_cuda:
             block = _SORT_BLOCK_SIZE if self._capacity > _MANY_EVENTS else BLOCK_SIZE
             wp.launch(
-                scan.sort_keys,
+                event_kernels.sort_keys,
                 dim=(world_count, block),
                 block_dim=block,
                 inputs=[self.stack.counters, self.stack.keys],
@@ -233,17 +230,12 @@ class WorldEventCamera:
             for world in range(*worlds):
                 keys[world, : counts[world]].sort()  # several times as fast as the network on a CPU
 
-        self._share(sort)
+        parts = min(core_count(), world_count)
+        share(sort, list(itertools.pairwise(world_count * part // parts for part in range(parts + 1))))
 
     def take_frames(self, frame_count: int, part: int, parity: int) -> None:
-        """Scan all pixels: on a CUDA device at once, on the CPU some worlds on each core."""
-
-        def take(worlds: tuple[int, int]) -> None:
-            self._states.launch(
-                self.stack, parity, 1 - parity, frame_count=frame_count, part=part, worlds=worlds
-            )
-
-        self._share(take)
+        """Scan all pixels."""
+        self._states.launch(self.stack, parity, 1 - parity, frame_count=frame_count, part=part)
 
     def record_scan(self, parity: int) -> Any:
         """Return the launch of the scan of one frame of all worlds, on CUDA; `stack` may change meanwhile."""
@@ -252,42 +244,18 @@ class WorldEventCamera:
             return states.launch(self.stack, parity, 1 - parity, frame_count=1, record_cmd=True)
         world_count, pixel_count = self._shape
         blocks = -(-pixel_count // (BLOCK_SIZE * PIXELS_PER_THREAD))
-        seen = [states.base, states.last[parity], states.crossed[parity]]
         return wp.launch(
             scan_frame,
             dim=(world_count, blocks * BLOCK_SIZE),
             block_dim=BLOCK_SIZE,
-            inputs=[states.thresholds, self._width, self.row_shift, self.time_shift, *seen, self.stack],
-            outputs=[states.last[1 - parity], states.crossed[1 - parity]],
+            inputs=[states.thresholds, self.layout, states.ring[parity], self.stack],
+            outputs=[states.ring[1 - parity]],
             device=self.device,
             record_cmd=True,
         )
 
-    def _share(self, work: Callable[[tuple[int, int]], None]) -> None:
-        """Do some worlds on each core of a CPU; on a CUDA device all at once."""
-        world_count = self._shape[0]
-        parts = min(core_count(), world_count) if self.device.is_cpu else 1
-        share(work, list(itertools.pairwise(world_count * part // parts for part in range(parts + 1))))
-
     def _launch(self, kernel: Any, dim: int, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
-
-    def _make_stack(self, frames: wp.array3d[wp.float32], frame_count: int) -> Any:
-        world_count = frames.shape[0]
-        stack = scan.Stack()
-        stack.log_radiance = frames
-        stack.stamps = self._zeros((world_count, frame_count + 1), wp.int64)
-        stack.origin_us = self._zeros(world_count, wp.int64)
-        stack.since_reset_ns = self._zeros(world_count, wp.int64)
-        stack.row_limit = wp.full(
-            (world_count, frame_count), self._height, dtype=wp.int32, device=self.device
-        )
-        stack.overflow = self._zeros(world_count, wp.int32)
-        stack.table = self._zeros((world_count, frame_count, self._height), wp.int32)
-        stack.keys = self._empty((world_count, self._capacity), wp.int64)
-        stack.counters = self._zeros((world_count, 3), wp.int64)
-        stack.dropped = self._zeros(world_count, wp.int32)
-        return stack
 
     def _empty(self, shape: int | tuple[int, ...], dtype: Any) -> Any:
         return wp.empty(shape, dtype=dtype, device=self.device)

@@ -9,10 +9,13 @@ becomes the level crossed. The tie rule is in `EventCamera`; pixels are in `even
 Reference: Lichtsteiner, Posch, Delbruck (2008); Rebecq, Gehrig, Scaramuzza (2018), ESIM.
 """
 
+from __future__ import annotations
+
 import functools
+import logging
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -21,16 +24,18 @@ from numpy.typing import NDArray
 from neurosim_core.clock import NS_PER_US
 from neurosim_core.packets import Events
 from neurosim_core.runtime.cuda import Fence, GraphCache, make_stream, use_stream
-from neurosim_core.sensors import event_cut, event_input
+from neurosim_core.sensors import event_input
 from neurosim_core.sensors.event_batch import EventCameraBatch, FrameEvents
 from neurosim_core.sensors.event_config import EventCameraConfig
-from neurosim_core.sensors.event_keys import EventKeys, Labeller
-from neurosim_core.sensors.event_levels import SUB_BITS
-from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, terms_of
-from neurosim_core.sensors.event_pixels import LostEvents, Pixels, Scan
+from neurosim_core.sensors.event_keys import EventKeys, LostEvents
+from neurosim_core.sensors.event_pixels import Pixels, PixelStates, Scan
 from neurosim_core.sensors.event_readout import Readout
-from neurosim_core.sensors.event_states import PixelStates
 from neurosim_core.warp_start import start_warp
+
+if TYPE_CHECKING:
+    from neurosim_core.sensors.event_labels import EventLabels
+
+_log = logging.getLogger(__name__)
 
 _MIXED = "step() and feed() must not be mixed: call reset() between them"
 
@@ -94,7 +99,7 @@ class EventCamera:
         scan_count_max: int = 1,
         on_host: bool = False,
         terms: Sequence[str] | None = None,
-        labels: Labeller | None = None,
+        labels: EventLabels | None = None,
     ) -> None:
         for name, value in (("width", width), ("height", height)):
             if not 1 <= value <= 1 << 16:
@@ -109,7 +114,7 @@ class EventCamera:
         self.device = wp.get_device(device)
         # scans under way begin with a state each, and the last of them needs room for the state after it
         ring_size = scan_count_max + 1
-        pixel_terms = terms_of(config) if terms is None else tuple(terms)
+        pixel_terms = config.terms() if terms is None else tuple(terms)
         self.terms = pixel_terms if config.readout is None else (*pixel_terms, "readout")
         states = PixelStates(
             [config],
@@ -120,8 +125,9 @@ class EventCamera:
             sensor=sensor,
             seeds=[seed],
             terms=pixel_terms,
+            split_pixels=True,
         )
-        self._row_shift, self._time_shift = states.row_shift, states.time_shift
+        self._time_shift = states.layout.time_shift
         self._pixels = Pixels(states, width=width, height=height, device=self.device)
         self._scan_count_max = scan_count_max
         self._graphs = GraphCache(device)
@@ -130,14 +136,13 @@ class EventCamera:
         self._on_host = on_host or self.device.is_cpu
         self._keys = EventKeys(
             pixel_count=width * height,
-            row_shift=self._row_shift,
-            time_shift=self._time_shift,
+            layout=states.layout,
             device=self.device,
             on_host=self._on_host,
             labels=labels,
         )
         # a scan that nothing is cut beside writes its keys to where they stay
-        self._in_place = scan_count_max == 1 and self._pixels.chunk_count == 1
+        self._in_place = scan_count_max == 1 and states.slot_count == 1
         # on CUDA one more than is needed: scans and states then take turns together, in few graphs
         scan_count = ring_size if self.device.is_cuda and not self._in_place else scan_count_max
         self._idle = deque(self._make_scan(16) for _ in range(scan_count))
@@ -147,14 +152,10 @@ class EventCamera:
             self._readout = Readout(
                 config.readout,
                 height=height,
-                row_shift=self._row_shift,
-                time_shift=self._time_shift,
-                pixel_shift=SUB_BITS + (CAUSE_BITS if CAUSE in pixel_terms else 0),
-                device=self.device,
+                layout=states.layout,
                 seed=seed,
                 sensor=sensor,
             )
-        wp.load_module(event_cut, device=self.device)
 
         size: dict[str, Any] = {"width": width, "height": height, "device": device}
         new_stepper = functools.partial(EventCameraBatch, config, count=1, sensor=sensor, seed=seed, **size)
@@ -241,7 +242,7 @@ class EventCamera:
             if not self._require_reset() == self._fed_ns == self._reset_ns:
                 raise RuntimeError(_MIXED)
             stepper = self._make_stepper()
-            stepper.reset(self._pixels.states.base.reshape((self.height, self.width)), self._reset_ns)
+            stepper.reset(self._pixels.states.ring[0].base.reshape((self.height, self.width)), self._reset_ns)
             self._stepper = stepper
         return self._stepper.step(log_radiance, stamp_ns)
 
@@ -271,17 +272,15 @@ class EventCamera:
         self._check_feed(log_radiance, stamps)
         self._taken.wait_on_stream()
         count = len(stamps)
-        if count > self._idle[0].row_limit.shape[0]:
+        if count > self._idle[0].stack.row_limit.shape[1]:
             self._idle[0] = self._make_scan(count)
         scan = self._idle[0]
         if self._in_place:
-            scan.chunks[0].keys, scan.chunks[0].first_key = self._keys.room(), self._keys.count
+            scan.keys, scan.first_key = self._keys.room(), self._keys.count
         else:
             self._pixels.make_room(scan)
         scan.begin()
-        scan.frames = log_radiance
-        scan.stamps_ns = stamps
-        self._keys.expect(count)
+        scan.frames, scan.stamps_ns = log_radiance, stamps
         scan.origin_us = self._keys.origin_us
         scan.state = self._state
         origin_ns = scan.origin_us * NS_PER_US
@@ -377,7 +376,7 @@ class EventCamera:
         self._idle = deque(sorted(scans, key=lambda scan: scan.number))  # as at the first time: same graphs
         self._under_way.clear()
         self._state = 0
-        self._lost = LostEvents(self.sensor, self.config.event_count_max)
+        self._lost, self._warned = LostEvents(), False
         self._sequence = 0
         self._window_start_ns = self._now_ns or 0
         self._keys.clear(self._window_start_ns // NS_PER_US)
@@ -404,8 +403,8 @@ class EventCamera:
         if self._in_place:
             self._keys.note(counts[0])
         else:
-            for count, chunk in zip(counts, scan.chunks, strict=True):
-                self._keys.append(chunk.keys, 0, count, scan.origin_us)
+            for slot, count in enumerate(counts):
+                self._keys.append(scan.keys, slot * scan.room, count, scan.origin_us)
         self._now_ns = int(scan.stamps_ns[-1])
         scan.frames = None
         self._idle.append(self._under_way.popleft())
@@ -418,19 +417,19 @@ class EventCamera:
         if not scan.has_room(counts):
             if self._in_place:
                 self._keys.reserve(self._keys.count + counts[0])
-                scan.chunks[0].keys = self._keys.room()
+                scan.keys = self._keys.room()
             else:
                 self._pixels.grow(scan, counts)
             self._scan_again(scan)
             scan.done.wait()  # the frames are the caller's again
         if limited:
-            scan.row_limit.fill_(self.height)
+            scan.stack.row_limit.fill_(self.height)
         return counts
 
     def _read_counts(self, scan: Scan) -> list[int]:
-        """Wait for a scan and return the number of events of each chunk."""
+        """Wait for a scan and return the number of events of each slot."""
         scan.done.wait()
-        counters = [chunk.counters_on_host.view(0, 3).tolist() for chunk in scan.chunks]
+        counters = scan.counters_on_host.view(0, len(scan.counters))[:, :3].tolist()
         if invalid_count := sum(invalid for _, invalid, _ in counters):
             first = len(scan.stamps_ns) * self.width * self.height - max(place for *_, place in counters)
             frame, pixel = divmod(first, self.width * self.height)
@@ -439,27 +438,33 @@ class EventCamera:
             self._idle += self._under_way
             self._under_way.clear()
             raise ValueError(event_input.invalid_message(invalid_count, f"[{frame}, {row}, {col}]"))
-        return [end - chunk.first_key for (end, _, _), chunk in zip(counters, scan.chunks, strict=True)]
+        return [end - scan.first_key for end, _, _ in counters]
 
     def _limit_rows(self, scan: Scan) -> bool:
         """Where a frame has too many events, keep the rows from the top that fit; return whether one has."""
-        stamps = scan.stamps_ns
-        total = np.cumsum(self._pixels.count_by_row(scan), axis=1, dtype=np.int64)
-        rows = (total <= self.config.event_count_max).sum(axis=1)
-        short = np.flatnonzero(rows < self.height)
-        for frame in short:
-            kept = int(total[frame, rows[frame] - 1]) if rows[frame] > 0 else 0
-            self._lost.add(int(stamps[frame]), int(total[frame, -1]) - kept)
+        lost = self._pixels.limit_rows(scan, self.config.event_count_max)
+        short = np.flatnonzero(lost)
         if len(short) == 0:
             return False
-        wp.copy(scan.row_limit, wp.array(rows, dtype=wp.int32, device=self.device), count=len(rows))
+        self._lost.add(scan.stamps_ns[short], lost[short])
+        if not self._warned:
+            _log.warning(
+                "%s: more than event_count_max = %d events between two frames, %d dropped before %d ns;"
+                " further losses are only counted in Events.dropped_count",
+                self.sensor or "event camera",
+                self.config.event_count_max,
+                lost[short[0]],
+                scan.stamps_ns[short[0]],
+            )
+            self._warned = True
         self._scan_again(scan)
         return True
 
     def _begin_cut(self, ends: list[int]) -> Callable[[], list[Events]]:
         """Sort the keys; what is returned hands out those of the windows, and carries the others over."""
         if self._readout is not None:
-            self._keys.read_out(self._readout, self._require_reset())
+            lost_ns = self._keys.read_out(self._readout, self._require_reset())
+            self._lost.add(lost_ns, np.ones_like(lost_ns))
         span_us = self._require_reset() // NS_PER_US - self._keys.origin_us
         # with a readout events may be read later than now
         end_bit = self._time_shift + (span_us + 1).bit_length() if self._readout is None else 63
@@ -479,9 +484,6 @@ class EventCamera:
         """Return the packets of windows, each of which ends at a place in the columns."""
         packets = []
         for start, cut, end_ns in zip([0, *cuts], cuts, ends, strict=False):
-            dropped = self._lost.take(end_ns)
-            if self._readout is not None:
-                dropped += self._readout.take_dropped(end_ns)
             found = [column[start:cut] for column in columns] if cut > start else self._keys.no_events()
             packets.append(
                 Events(
@@ -492,7 +494,7 @@ class EventCamera:
                     width=self.width,
                     height=self.height,
                     start_ns=self._window_start_ns,
-                    dropped_count=dropped,
+                    dropped_count=self._lost.take(end_ns),
                 )
             )
             self._sequence += 1

@@ -30,7 +30,7 @@ from neurosim_core.render.launch import kernel_variant
 from neurosim_core.sensors.base import SamplerContext, StateSensorConfig
 from neurosim_core.sensors.state_sampler import NonNegative, Sampling, StateSampler
 from neurosim_core.settings import fill_from_preset
-from neurosim_core.tables import read_table
+from neurosim_core.settings_file import read_table
 
 CORRELATION_TIMES_S = tuple(10.0 ** (exponent / 2.0) for exponent in range(-2, 7))
 """Bias instability: correlation times of the Gauss-Markov processes whose sum is flicker noise [s], 0.1 ...
@@ -121,11 +121,6 @@ def _normal6(seed: wp.uint64, stream: wp.uint32, step: wp.int64, element: wp.int
 @functools.cache
 def make_kernel(terms: frozenset[str]) -> Any:
     """Return the kernel that computes only the given errors, some of `TERMS`."""
-    white = "white" in terms
-    walk = "walk" in terms
-    instability = "instability" in terms
-    saturation = "saturation" in terms
-    quantisation = "quantisation" in terms
 
     @kernel_variant(__name__, *sorted(terms))
     def measure(
@@ -154,13 +149,13 @@ def make_kernel(terms: frozenset[str]) -> Any:
 
         seed = at.seeds[world]
         k = at.sample[world]
-        if wp.static(walk):
+        if wp.static("walk" in terms):
             bias = vec6d()
             if k > wp.int64(0):
                 bias = walk_bias[world] + wp.cw_mul(model.walk, _normal6(seed, model.walk_stream, k, 0))
             walk_bias[world] = bias
             reading += bias
-        if wp.static(instability):
+        if wp.static("instability" in terms):
             process_count = processes.shape[1]  # no constant: unrolled, it compiles four times as long
             for process in range(process_count):
                 drive = wp.cw_mul(model.instability, _normal6(seed, model.instability_stream, k, process))
@@ -171,12 +166,12 @@ def make_kernel(terms: frozenset[str]) -> Any:
                     value += wp.sqrt(wp.float64(1.0) - decay * decay) * drive
                 processes[world, process] = value
                 reading += value
-        if wp.static(white):
+        if wp.static("white" in terms):
             reading += wp.cw_mul(model.white, _normal6(seed, model.white_stream, k, 0))
         for axis in range(6):
-            if wp.static(saturation):
+            if wp.static("saturation" in terms):
                 reading[axis] = wp.clamp(reading[axis], -model.limit[axis], model.limit[axis])
-            if wp.static(quantisation):
+            if wp.static("quantisation" in terms):
                 step = model.resolution[axis]
                 if step > wp.float64(0.0):
                     reading[axis] = step * wp.rint(reading[axis] / step)
@@ -244,7 +239,7 @@ def _model(config: ImuConfig, *, gravity_m_s2: float, name: str) -> Any:
     share = math.sqrt(math.log(ratio) / math.pi)
     model = _Model()
     model.position = wp.vec3d(*config.mount.position_m)
-    model.q_SB = wp.quatd(*config.mount.rotation().inv().as_quat())
+    model.q_SB = wp.quat_inverse(wp.quatd(*config.mount.quaternion()))
     model.gravity = gravity_m_s2
     model.white = six(config.accelerometer_noise_density, config.gyroscope_noise_density, math.sqrt(rate_hz))
     model.walk = six(config.accelerometer_random_walk, config.gyroscope_random_walk, 1.0 / math.sqrt(rate_hz))

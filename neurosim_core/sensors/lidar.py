@@ -34,7 +34,7 @@ from neurosim_core.sensors.base import PictureContext, PictureSensorConfig
 from neurosim_core.sensors.lidar_scans import AnyScan, SpinningScan
 from neurosim_core.sensors.pixel_process import Batch, PixelProcess, element_of
 from neurosim_core.settings import Settings, fill_from_preset
-from neurosim_core.tables import read_table
+from neurosim_core.settings_file import read_table
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 _RAY = np.complex128  # the four numbers of a ray as one: NumPy moves those three times as fast

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from neurosim_core.clock import Rate
 from neurosim_core.frames import Mount
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.ray_times import RayTiming
-from neurosim_core.sensors.base import RenderedConfig, RenderRequest, SensorConfig
+from neurosim_core.sensors.base import RenderedConfig, SensorConfig
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,64 +52,41 @@ def plan_render_groups(sensors: Mapping[str, SensorConfig]) -> tuple[RenderGroup
     instants a frame sensor sees. For the same reason adaptive frame sensors share a group only if they ask
     for the same renders, and image sensors do not join them.
     """
-    plans: list[_Plan] = []
     cameras = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, RenderedConfig)}
     requests = {name: camera.render_request() for name, camera in cameras.items()}
+    frames = [name for name, request in requests.items() if request.every_instant]
+    images = [name for name in requests if name not in frames]
+    images.sort(key=lambda name: -requests[name].rate_hz)  # fastest first: others may join
 
-    def join(name: str) -> None:
-        camera, request = cameras[name], requests[name]
-        clock = _Clock(request.rate_hz, request.max_displacement_px, request.required)
-        for plan in plans:
-            fits = clock == plan.clock if request.every_instant else plan.clock.contains(clock)
-            same = (plan.lens, plan.mount, plan.timing) == (camera.optics, camera.mount, camera.timing)
-            if same and fits:
-                plan.members.append(name)
-                return
-        plans.append(_Plan(camera.optics, camera.mount, camera.timing, clock, [name]))
-
-    for name, request in requests.items():
+    def fits(name: str, first: str) -> bool:
+        """Return whether a camera may join the group that another has begun."""
+        camera, other = cameras[name], cameras[first]
+        if (camera.optics, camera.mount, camera.timing) != (other.optics, other.mount, other.timing):
+            return False
+        request, clock = requests[name], requests[first]
         if request.every_instant:
-            join(name)
-    images = [name for name, request in requests.items() if not request.every_instant]
-    for name in sorted(images, key=lambda name: -requests[name].rate_hz):  # fastest first: others may join
-        join(name)
-    return tuple(_group(plan, requests, cameras) for plan in plans)
+            when = (request.rate_hz, request.max_displacement_px, request.required)
+            return when == (clock.rate_hz, clock.max_displacement_px, clock.required)
+        return clock.max_displacement_px is None and Rate(clock.rate_hz).contains(Rate(request.rate_hz))
 
-
-class _Clock(NamedTuple):
-    """When a camera needs rays."""
-
-    rate_hz: float
-    max_displacement_px: float | None
-    required: Rate | None
-
-    def contains(self, other: _Clock) -> bool:
-        """Whether every tick of another clock is rendered by this one."""
-        return self.max_displacement_px is None and Rate(self.rate_hz).contains(Rate(other.rate_hz))
-
-
-class _Plan(NamedTuple):
-    """A group that cameras may still join."""
-
-    lens: Lens
-    mount: Mount
-    timing: RayTiming | None
-    clock: _Clock
-    members: list[str]
-
-
-def _group(
-    plan: _Plan, requests: Mapping[str, RenderRequest], cameras: Mapping[str, RenderedConfig]
-) -> RenderGroup:
-    frames = tuple(name for name in plan.members if requests[name].every_instant)
-    return RenderGroup(
-        lens=plan.lens,
-        mount=plan.mount,
-        timing=plan.timing,
-        look_back_ns=max(cameras[name].look_back_ns for name in plan.members),
-        rate=Rate(plan.clock.rate_hz),
-        frame_sensors=frames,
-        image_sensors=tuple(name for name in plan.members if name not in frames),
-        outputs=frozenset().union(*(requests[name].outputs for name in plan.members)),
-        max_displacement_px=plan.clock.max_displacement_px,
+    groups: list[list[str]] = []
+    for name in (*frames, *images):
+        group = next((group for group in groups if fits(name, group[0])), None)
+        if group is None:
+            groups.append([name])
+        else:
+            group.append(name)
+    return tuple(
+        RenderGroup(
+            lens=cameras[names[0]].optics,
+            mount=cameras[names[0]].mount,
+            timing=cameras[names[0]].timing,
+            look_back_ns=max(cameras[name].look_back_ns for name in names),
+            rate=Rate(requests[names[0]].rate_hz),
+            frame_sensors=tuple(name for name in names if requests[name].every_instant),
+            image_sensors=tuple(name for name in names if not requests[name].every_instant),
+            outputs=frozenset().union(*(requests[name].outputs for name in names)),
+            max_displacement_px=requests[names[0]].max_displacement_px,
+        )
+        for names in groups
     )

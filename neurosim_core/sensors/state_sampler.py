@@ -2,6 +2,9 @@
 # mypy: disable-error-code="no-untyped-def"
 """What small sensors share: errors of a measurement, delays, dropouts, and a sampler of one kernel.
 
+The engine makes and reads state sensors by `make_sampler` and `sample_packet`, which say by the sensor's name
+what the code of one lacks.
+
 Errors are added per axis: a random walk from 0, a first-order Gauss-Markov process that is stationary from
 the first sample on, white noise, and rounding. They are addressed by seed, name and number of the sample
 since the reset, so that they depend on nothing else.
@@ -399,3 +402,59 @@ def make_reader(
         group_count=len(errors),
         late=late,
     )
+
+
+def make_sampler(config: StateSensorConfig, context: SamplerContext) -> Sampler:
+    """Return a state sensor at work, and check what it has allocated.
+
+    Raises:
+        TypeError: It has no arrays.
+        ValueError: An array has another shape than it needs.
+    """
+    made, shape = config.make(context), (context.slot_count, context.vehicle.count)
+    arrays = getattr(made, "arrays", None)
+    if not isinstance(arrays, Mapping):
+        raise TypeError(
+            f"sensor {context.name!r}: {type(made).__qualname__} must set `self.arrays`, what it measures by "
+            f"name: device arrays of shape [slot, world, ...], here {shape}; got {arrays!r}"
+        )
+    for field, array in arrays.items():
+        if tuple(array.shape[:2]) != shape:
+            raise ValueError(
+                f"sensor {context.name!r}: arrays[{field!r}] needs shape [slot, world, ...], here "
+                f"{shape}, got {tuple(array.shape)}: (context.slot_count, context.vehicle.count, ...)"
+            )
+    return made
+
+
+class _Rows(dict[str, NDArray[Any]]):
+    """The rows of a sample; one that is not there is said by the names of those that are."""
+
+    sensor = ""
+
+    def __missing__(self, key: str) -> NDArray[Any]:
+        raise KeyError(f"sensor {self.sensor!r}: no array {key!r} was measured, known: {sorted(self)}")
+
+
+def sample_packet(
+    sampler: Sampler, rows: Mapping[str, NDArray[Any]], *, stamp_ns: int, sequence: int, sensor: str
+) -> Packet | None:
+    """Return one sample of a state sensor as a packet, and check that it has the header.
+
+    Raises:
+        KeyError: It asks for an array that it does not measure.
+        TypeError: It gives something else than a packet.
+        ValueError: The packet has not the header that it was given.
+    """
+    known = _Rows(rows)
+    known.sensor = sensor
+    packet = sampler.packet(known, stamp_ns=stamp_ns, sequence=sequence, sensor=sensor)
+    if packet is None:
+        return None
+    if not isinstance(packet, Packet):
+        raise TypeError(f"sensor {sensor!r}: packet() must return a packet or None, got {packet!r:.80}")
+    if packet.sensor != sensor:
+        raise ValueError(
+            f"sensor {sensor!r}: packet() must pass the header on: {type(packet).__qualname__}(..., **header)"
+        )
+    return packet

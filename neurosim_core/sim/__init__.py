@@ -4,7 +4,7 @@ from neurosim_core.sim.integrate import COLLISION, forget_controllers
 from neurosim_core.sim.model import Model, make_fleet, make_model, plan_paths
 from neurosim_core.sim.render_group import move_bodies
 from neurosim_core.sim.rollout import (
-    acquire_rooms,
+    acquire_next_picture_buffers,
     advance,
     begin_step,
     end_step,
@@ -34,7 +34,7 @@ __all__ = [
     "Simulation",
     "StartState",
     "State",
-    "acquire_rooms",
+    "acquire_next_picture_buffers",
     "advance",
     "begin_step",
     "end_step",

@@ -53,8 +53,8 @@ class RenderJob:
     """0 where a world is not rendered, device array of int32, shape [world]; None: all are."""
     pattern: Hashable | None
     """Same pattern, same launches; None: they do not come again, or more than launches is done."""
-    rooms: dict[tuple[str, int], NDArray[Any]] = field(default_factory=dict)
-    """Memory of the caller's that pictures are copied to, by camera and stamp."""
+    picture_buffers: dict[tuple[str, int], NDArray[Any]] = field(default_factory=dict)
+    """Buffers of the caller that pictures are copied to, by camera and stamp."""
 
 
 def launch_cameras(model: Model, state: State, batch: Batch) -> None:
@@ -64,7 +64,7 @@ def launch_cameras(model: Model, state: State, batch: Batch) -> None:
     with timed(state.wall_s, "render"), use_stream(stream):
         state.flown[batch.number % state.render_backlog].wait_on_stream()
         for job in plan_jobs(state, batch, chosen):
-            acquire_room(job)
+            acquire_picture_buffers(job)
             if (key := launch_key(job)) is None:
                 render(job)
             else:
@@ -188,24 +188,24 @@ def plan_job(state: State, batch: Batch, index: int, places: Sequence[int]) -> R
     )
 
 
-def acquire_room(job: RenderJob) -> None:
-    """Ask for memory for the pictures of a job that have none yet, if a device copies them there."""
-    if job.group.make_room is None:
+def acquire_picture_buffers(job: RenderJob) -> None:
+    """Ask the caller for buffers for the pictures of a job that have none yet."""
+    if job.group.allocate_picture is None:
         return
     for stamp_ns, slot, name in job.pictures:
-        if (name, stamp_ns) not in job.rooms:
+        if (name, stamp_ns) not in job.picture_buffers:
             picture = job.buffers.copies[job.group.images[name].source].view(slot, 1)[0]
-            room = job.group.make_room(name, stamp_ns, picture)
-            if room is not None:
-                job.rooms[name, stamp_ns] = room
+            buffer = job.group.allocate_picture(name, stamp_ns, picture)
+            if buffer is not None:
+                job.picture_buffers[name, stamp_ns] = buffer
 
 
 def launch_key(job: RenderJob) -> Hashable | None:
-    """Return the key of the launches of a job: they copy pictures to where there is room now."""
-    if job.pattern is None or job.group.make_room is None:
+    """Return the key of the launches of a job: they copy pictures to the buffers that there are now."""
+    if job.pattern is None or job.group.allocate_picture is None:
         return job.pattern
-    places = (job.rooms.get((name, stamp_ns)) for stamp_ns, _, name in job.pictures)
-    addresses = (0 if room is None else room.__array_interface__["data"][0] for room in places)
+    places = (job.picture_buffers.get((name, stamp_ns)) for stamp_ns, _, name in job.pictures)
+    addresses = (0 if buffer is None else buffer.__array_interface__["data"][0] for buffer in places)
     return job.pattern, PinnedMapping.made_count, *addresses
 
 
@@ -241,17 +241,17 @@ def render(job: RenderJob) -> tuple[Any, Any]:
             buffers.processes[name].launch(views)
         if name in group.shared_pictures:
             wp.copy(group.pictures[name], group.shared_pictures[name])
-    if group.make_room is None:
+    if group.allocate_picture is None:
         for source, copy in buffers.copies.items():
             copy.fetch(0, instant_count if source in INSTANT_OUTPUTS else job.image_count)
     else:
         for stamp_ns, slot, name in job.pictures:
             copy = buffers.copies[group.images[name].source]
-            room = job.rooms.get((name, stamp_ns))
-            if room is None:
+            buffer = job.picture_buffers.get((name, stamp_ns))
+            if buffer is None:
                 copy.fetch(slot, 1)
             else:
-                copy.fetch_into(room, slot)
+                copy.fetch_into(buffer, slot)
     return job.from_slots, job.to_slots
 
 
@@ -265,9 +265,9 @@ def scan(state: State, batch: Batch) -> None:
 
 
 def _is_late(batch: Batch) -> bool:
-    """Return whether all that cameras yield is pictures that go to room of the caller's, and all count."""
+    """Return whether all that cameras yield is pictures in buffers of the caller, and all count."""
     return batch.until_ns == batch.boundaries[-1].stamp_ns and all(
-        not job.frames and len(job.rooms) == len(job.pictures) for job in batch.jobs or ()
+        not job.frames and len(job.picture_buffers) == len(job.pictures) for job in batch.jobs or ()
     )
 
 
@@ -305,7 +305,7 @@ def read_cameras(
 def _read_images(job: RenderJob, *, borrow: bool) -> list[Packet]:
     """Return the pictures of a job that the device has finished with.
 
-    With `borrow` those for which the caller has no room are views that are valid until the buffers are
+    With `borrow` those for which the caller has no buffer are views that are valid until the buffers are
     overwritten, not copies, if what their sensor yields is an `Image`: of other packets nobody knows whether
     they keep a view.
     """
@@ -313,7 +313,7 @@ def _read_images(job: RenderJob, *, borrow: bool) -> list[Packet]:
     packets: list[Packet] = []
     for stamp_ns, slot, name in job.pictures:
         image = job.group.images[name]
-        picture = job.rooms.pop((name, stamp_ns), None)
+        picture = job.picture_buffers.pop((name, stamp_ns), None)
         if picture is None:
             picture = job.buffers.copies[image.source].view(slot, 1)[0]
             if not (borrow and image.gives_images):

@@ -15,7 +15,7 @@ from neurosim_core.frames import as_rows
 from neurosim_core.packets import Collision, Odometry, Packet
 from neurosim_core.runtime.cuda import use_stream
 from neurosim_core.runtime.timing import timed
-from neurosim_core.sensors.sampler_checks import sample_packet
+from neurosim_core.sensors.state_sampler import sample_packet
 from neurosim_core.sim.inputs import CommandBuffer
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.schedule import Boundary

@@ -134,7 +134,7 @@ def _move(
 class KinematicVehicle:
     """Bodies in place of vehicles, each at the pose that its path prescribes at its stamp.
 
-    They are what the engine asks of a vehicle (`vehicle.host_vehicle.Vehicle`). Rotors stand still; of the
+    They are what the engine asks of a vehicle (`vehicle.base.Vehicle`). Rotors stand still; of the
     `config` IMUs need gravity.
     """
 

@@ -13,20 +13,23 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from neurosim_core.clock import Rate, to_ns
 from neurosim_core.config import SimulationConfig
+from neurosim_core.path_process import NotPlannedError, PlanningProcess
 from neurosim_core.render.renderer import upload_scene
 from neurosim_core.runtime.timing import timed
 from neurosim_core.scene.bodies import Body, make_bodies
 from neurosim_core.scene.freespace import FreeSpace, choose_seed, make_free_space, map_distances
 from neurosim_core.scene.reader import NotReadError, SceneReader
-from neurosim_core.scene.scene import Scene
+from neurosim_core.scene.scene import Material, Scene, Texture
 from neurosim_core.sensors.base import StateSensorConfig
 from neurosim_core.sensors.render_plan import RenderGroup, plan_render_groups
 from neurosim_core.sim.schedule import Schedule
-from neurosim_core.trajectory import CollisionFreeConfig, Path, load_scipy, make_path
+from neurosim_core.trajectory import CollisionFreeConfig, Path, check_thrust, make_path
+from neurosim_core.trajectory.shapes import HoverConfig, hover
 from neurosim_core.vehicle import MultirotorConfig
 from neurosim_core.warp_start import start_warp
 
@@ -75,8 +78,9 @@ def make_model(
         config: What to fly; one vehicle.
         reader: Reads the scene in another process; None: it is read here.
         on_phase: Told the name of each part of the work when it begins.
-        meanwhile: Called while the scene is lit with the model as it is without cameras (`warm_flight`), and
-            with what says whether the scene is lit.
+        meanwhile: Called while the scene is lit and paths are planned (`warm_flight`) with a model that needs
+            the same kernels: it hovers, and sees a triangle, or nothing by a renderer that is not `warp`. Its
+            second argument says whether the scene is lit.
 
     Raises:
         ValueError: There are several vehicles, the scene cannot be loaded, no path exists, or the device is
@@ -146,7 +150,7 @@ def _make_fleet(
     members = {name: config.of(name) for name in config.vehicles}
     seeing = any(plan_render_groups(member.sensors) for member in members.values())
     bodies = make_bodies(config.bodies) if seeing else ()
-    with ThreadPoolExecutor(max_workers=4) as aside:
+    with ThreadPoolExecutor(max_workers=5) as aside:
         beginning = aside.submit(wp.zeros, 1, device=device)  # a CUDA context begins while the scene is read
 
         def map_scene() -> FreeSpace:
@@ -154,14 +158,14 @@ def _make_fleet(
             beginning.result()  # Warp makes a device's streams at its first use, which must be in one thread
             return map_distances(geometry, config.free_space, device)
 
-        def light_scene() -> tuple[Scene, Any]:
-            whole = reading.result() if reader is None else reader.scene(config.scene)
-            if not seeing:
-                return whole, None
+        def plan_there() -> tuple[FreeSpace, dict[str, Path]]:
+            if reader is None or reader.planner is None:
+                raise NotPlannedError
+            return _plan_there(members, reader.planner, mapping.result(), reading.result())
+
+        def upload(scene: Scene) -> Any:
             beginning.result()
-            return whole, upload_scene(
-                whole, config.render, device=device, renderer=config.renderer, bodies=bodies
-            )
+            return upload_scene(scene, config.render, device=device, renderer=config.renderer, bodies=bodies)
 
         with phase("scene"):
             if reader is None:  # in this thread, where Ctrl-C interrupts it
@@ -169,27 +173,59 @@ def _make_fleet(
                 reading = aside.submit(lambda: scene)
             else:
                 reading = aside.submit(reader.geometry, config.scene)
-            mapping, lighting = aside.submit(map_scene), aside.submit(light_scene)
-            if reader is not None:
-                load_scipy()  # while the other process reads, and distances are mapped
-            scene = reading.result()
+            mapping = aside.submit(map_scene)
+            planning = aside.submit(plan_there)
+            scene = reading.result() if reader is None else reader.scene(config.scene)
+            lighting = None
+            if seeing:  # kernels that light needs, too, are loaded by the sketch: never in two threads
+                sketch = upload(_sketch(scene)) if meanwhile and config.renderer.kind == "warp" else None
+                lighting = aside.submit(upload, scene)
         with phase("free space"):
-            free_space = choose_seed(mapping.result(), scene, config.free_space)
+            room = mapping.result()
+        with phase("kernels"):
+            if meanwhile is not None and lighting is not None:
+                first = next(iter(members.values()))
+                if sketch is None:
+                    blind = {key: s for key, s in first.sensors.items() if isinstance(s, StateSensorConfig)}
+                    first = first.model_copy(update={"sensors": blind})
+                path = hover(HoverConfig(), position=room.seed_m)
+                warm = _make_member(first, device, scene, bodies, room, path, sketch, setup_s)
+                meanwhile(warm, lighting.done)
         with phase("path"):
-            paths = {name: plan_path(member, free_space) for name, member in members.items()}
-
-        def model_of(name: str, config: SimulationConfig, scene_on_device: Any) -> Model:
-            return _make_member(
-                config, device, scene, bodies, free_space, paths[name], scene_on_device, setup_s
-            )
-
+            try:
+                free_space, paths = planning.result()
+            except NotPlannedError:
+                free_space, paths = _plan_here(members, room, scene)
         with phase("light"):
-            if meanwhile is not None and seeing:
-                name, first = next(iter(members.items()))
-                blind = {key: s for key, s in first.sensors.items() if isinstance(s, StateSensorConfig)}
-                meanwhile(model_of(name, first.model_copy(update={"sensors": blind}), None), lighting.done)
-            scene, scene_on_device = lighting.result()
-    return {name: model_of(name, config, scene_on_device) for name, config in members.items()}
+            on_device = None if lighting is None else lighting.result()
+    return {
+        name: _make_member(member, device, scene, bodies, free_space, paths[name], on_device, setup_s)
+        for name, member in members.items()
+    }
+
+
+def _sketch(scene: Scene) -> Scene:
+    """Return a triangle that is rendered by the same kernels as a scene."""
+    glows = any(max(material.emission) > 0.0 for material in scene.materials)
+    texture = Texture(name="", srgb=np.zeros((1, 1, 3), np.uint8))
+    material = Material(
+        name="",
+        emission=(1.0, 1.0, 1.0) if glows else (0.0, 0.0, 0.0),
+        texture=texture if any(m.texture is not None for m in scene.materials) else None,
+    )
+    triangle = np.eye(3, dtype=np.float32)
+    return Scene(
+        name="",
+        vertices=triangle,
+        faces=np.array([[0, 1, 2]], np.int32),
+        normals=triangle,
+        uv=triangle[:, :2],
+        face_material=np.zeros(1, np.int32),
+        face_instance=np.zeros(1, np.int32),
+        instance_names=("",),
+        materials=(material,),
+        lights=scene.lights[:1],
+    )
 
 
 def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) -> dict[str, Path]:
@@ -209,6 +245,33 @@ def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) 
     return {name: plan_path(member, free_space) for name, member in members.items()}
 
 
+def _plan_there(
+    members: Mapping[str, SimulationConfig], planner: PlanningProcess, unseeded: FreeSpace, scene: Scene
+) -> tuple[FreeSpace, dict[str, Path]]:
+    """Have another process do what `_plan_here` does.
+
+    Raises:
+        NotPlannedError: It could not, or it would take longer than here.
+    """
+    flights = [(config.path, config.duration_s) for config in members.values()]
+    if not all(isinstance(path, CollisionFreeConfig) for path, _ in flights):
+        raise NotPlannedError
+    for config in members.values():
+        check_thrust(config.path, config.vehicle.airframe())
+    room = next(iter(members.values())).free_space
+    free_space, paths = planner.plan(unseeded, room, flights, inside_m=scene.inside_m)
+    return free_space, dict(zip(members, paths, strict=True))
+
+
+def _plan_here(
+    members: Mapping[str, SimulationConfig], unseeded: FreeSpace, scene: Scene
+) -> tuple[FreeSpace, dict[str, Path]]:
+    """Return the map of a scene with its seed, and the path of each vehicle by name."""
+    room = next(iter(members.values())).free_space
+    free_space = choose_seed(unseeded, room, inside_m=scene.inside_m)
+    return free_space, {name: plan_path(member, free_space) for name, member in members.items()}
+
+
 def plan_path(config: SimulationConfig, free_space: FreeSpace) -> Path:
     """Return the path of the only vehicle.
 
@@ -219,7 +282,8 @@ def plan_path(config: SimulationConfig, free_space: FreeSpace) -> Path:
     Raises:
         ValueError: No path exists, or it begins inside a solid or below the ground.
     """
-    path = make_path(config.path, free_space, config.vehicle.airframe(), duration_s=config.duration_s)
+    check_thrust(config.path, config.vehicle.airframe())
+    path = make_path(config.path, free_space, duration_s=config.duration_s)
     if not isinstance(config.path, CollisionFreeConfig):  # those begin in free space
         start = path.evaluate([0]).position[0]
         free_space.check_start(start)

@@ -52,7 +52,7 @@ from neurosim_core.sim.parameters import WorldSettings, lens_tables
 if TYPE_CHECKING:
     from neurosim_core.sensors.displacement import DisplacementRule
 
-MakeRoom = Callable[[str, int, NDArray[Any]], NDArray[Any] | None]
+PictureAllocator = Callable[[str, int, NDArray[Any]], NDArray[Any] | None]
 """Returns memory for a camera's picture of a stamp [ns], like the one that is given; None: there is none.
 On a CUDA device it is pinned, and the picture is there when the device has finished with the batch."""
 
@@ -143,7 +143,7 @@ class RenderGroupState:
     """Chooses the ticks that are rendered; None: all are."""
     only_launches: bool
     """See `RendererConfig.only_launches`."""
-    make_room: MakeRoom | None
+    allocate_picture: PictureAllocator | None
     """Gives memory that pictures are copied to as a part of the rendering; None: they get their own."""
 
 
@@ -155,13 +155,12 @@ def make_render_groups(
     history: Any,
     in_flight: int,
     on_host: bool,
-    make_room: MakeRoom | None,
+    allocate_picture: PictureAllocator | None,
 ) -> list[RenderGroupState]:
     """Allocate the buffers of all groups; there are none where the scene is not on the device.
 
     Seeds are those of each world, device array of uint64; the history is for sensors that look back. With
-    `on_host` pictures and events become packets; `acquire_room` asks `make_room` for memory to copy a picture
-    to.
+    `on_host` pictures and events become packets, and `allocate_picture` may give memory to copy a picture to.
 
     Raises:
         ValueError: The renderer cannot say what moves how far, and a group is adaptive; or a picture, or an
@@ -177,11 +176,11 @@ def make_render_groups(
         capacity = model.schedule.ticks_per_batch(index) if on_host else worlds.instant_count
         sensors = {name: model.config.sensors[name] for name in plan.frame_sensors}
         frames = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, FrameSensorConfig)}
-        rooms = {  # checked before anything is allocated
+        event_capacities = {  # checked before anything is allocated
             name: 0 if on_host else sensor.world_capacity(len(worlds.seeds), worlds.event_capacity)
             for name, sensor in frames.items()
         }
-        group = _make_group(plan, model, worlds, capacity, make_room, on_host=on_host)
+        group = _make_group(plan, model, worlds, capacity, allocate_picture, on_host=on_host)
         group.buffers = [
             _make_buffers(group, model, worlds, seeds, on_host=on_host) for _ in range(in_flight)
         ]
@@ -190,7 +189,7 @@ def make_render_groups(
             group.frames = _make_frames(group, model, frames, history, in_flight=in_flight, seed=seed)
         else:
             group.pictures, group.shared_pictures = _picture_arrays(group)
-            group.world_frames = _make_world_frames(group, frames, worlds, rooms)
+            group.world_frames = _make_world_frames(group, frames, worlds, event_capacities)
         groups.append(group)
     return groups
 
@@ -200,7 +199,7 @@ def _make_group(
     model: Model,
     worlds: WorldSettings,
     capacity: int,
-    make_room: MakeRoom | None,
+    allocate_picture: PictureAllocator | None,
     *,
     on_host: bool,
 ) -> RenderGroupState:
@@ -229,7 +228,7 @@ def _make_group(
         motions=motions,
         rule=_make_rule(plan, scene, p_BC, q_BC, motions),
         only_launches=model.config.renderer.only_launches,
-        make_room=make_room,
+        allocate_picture=allocate_picture,
     )
 
 
@@ -248,8 +247,6 @@ def _make_frames(
         name: sensor.make(
             FrameContext(
                 name=name,
-                width=lens.width,
-                height=lens.height,
                 lens=lens,
                 device=group.device,
                 in_flight=in_flight,
@@ -269,7 +266,7 @@ def _make_world_frames(
     group: RenderGroupState,
     sensors: Mapping[str, FrameSensorConfig],
     worlds: WorldSettings,
-    rooms: Mapping[str, int],
+    event_capacities: Mapping[str, int],
 ) -> dict[str, WorldFrameSensor]:
     """Return the frame sensors of many worlds, which read log radiance [N, K, H W]."""
     seen: Any = group.buffers[0].renderer.log_radiance
@@ -279,7 +276,7 @@ def _make_world_frames(
                 name=name,
                 configs=[rig[name] for rig in worlds.rigs],
                 frames=seen.reshape((group.world_count, group.capacity, seen.shape[1] * seen.shape[2])),
-                capacity=rooms[name],
+                capacity=event_capacities[name],
                 seeds=worlds.seeds,
                 ordered=worlds.ordered,
             )

@@ -20,7 +20,7 @@ from neurosim_core.control import CommandMode
 from neurosim_core.packets import Odometry, Packet
 from neurosim_core.runtime.timing import timed
 from neurosim_core.sim.cameras import (
-    acquire_room,
+    acquire_picture_buffers,
     disable_frame_sensors,
     is_due,
     launch_cameras,
@@ -39,7 +39,7 @@ from neurosim_core.sim.integrate import (
 )
 from neurosim_core.sim.model import Model, make_model
 from neurosim_core.sim.schedule import Boundary, batch_end_ns, boundaries, everything
-from neurosim_core.sim.state import Batch, PlannedStep, State, make_state
+from neurosim_core.sim.state import Batch, State, make_state
 from neurosim_core.sim.step import launch, read
 from neurosim_core.vehicle.arrays import read_state
 
@@ -135,11 +135,12 @@ def begin_step(
     _check_all_read(state)
     packets = start(model, state) if state.launched_count == 0 else []
     set_command(model, state, command, mode)
-    ahead, state.planned = state.planned, None
-    if ahead is None or (ahead.batch.number, ahead.batch.wanted) != (state.launched_count, state.wanted):
-        ahead = _plan_period(model, state)
-    launch(model, state, ahead.batch)
-    return PendingStep(packets, ahead.end_ns)
+    batch, state.planned = state.planned, None
+    if batch is None or (batch.number, batch.wanted) != (state.launched_count, state.wanted):
+        batch = _plan_period(model, state)
+    end_ns = _period_end_ns(model, state)
+    launch(model, state, batch)
+    return PendingStep(packets, end_ns)
 
 
 def prepare_step(model: Model, state: State) -> None:
@@ -150,18 +151,18 @@ def prepare_step(model: Model, state: State) -> None:
         state: Keeps the plan, which the next `begin_step` uses unless other cameras have been selected.
     """
     state.planned = _plan_period(model, state)
-    plan_ahead(model, state, state.planned.batch)
+    plan_ahead(model, state, state.planned)
 
 
-def acquire_rooms(state: State) -> None:
-    """Ask for room for the pictures of a control period that was prepared: `begin_step` is sooner then."""
+def acquire_next_picture_buffers(state: State) -> None:
+    """Ask for buffers for the pictures of a control period that was prepared: `begin_step` is sooner then."""
     if state.planned is not None:
-        for job in state.planned.batch.jobs or ():
-            acquire_room(job)
+        for job in state.planned.jobs or ():
+            acquire_picture_buffers(job)
 
 
 def settle(state: State) -> None:
-    """Wait until the device has written all pictures that were handed out (`make_state`, `make_room`)."""
+    """Wait until the device has written all pictures that were handed out (see `allocate_picture`)."""
     for done in state.batch_done:
         done.wait()
 
@@ -188,12 +189,14 @@ def warm_up(model: Model) -> None:
 
 
 def warm_flight(model: Model, *_: object) -> None:
-    """Compile and load the kernels of motion and control: fly one control period without cameras.
+    """Compile and load the kernels of a flight: look once, and fly one control period.
 
-    For `make_model(meanwhile=...)`. Nothing is in flight, and all is on the present stream of the device.
+    For `make_model(meanwhile=...)`. Nothing is in flight, and all is on the present stream of the device. No
+    launches come twice, which would be recorded as a graph while other threads launch.
     """
     state = make_state(model, in_flight=1)
     start(model, state)
+    state.wanted = frozenset()
     advance(model, state, batch_end_ns(model.schedule, 0, _period_end_ns(model, state)))
 
 
@@ -369,12 +372,10 @@ def _parts_of_period(model: Model, state: State) -> Iterator[int]:
         yield batch_end_ns(model.schedule, state.launched_ns, end_ns)
 
 
-def _plan_period(model: Model, state: State) -> PlannedStep:
+def _plan_period(model: Model, state: State) -> Batch:
     """Plan the first batch of the next control period."""
-    end_ns = _period_end_ns(model, state)
-    part_ns = batch_end_ns(model.schedule, state.launched_ns, end_ns)
-    stretch = boundaries(model.schedule, state.launched_ns, part_ns)
-    return PlannedStep(plan_batch(state, stretch, closed_loop=False), end_ns)
+    end_ns = next(_parts_of_period(model, state))
+    return plan_batch(state, boundaries(model.schedule, state.launched_ns, end_ns), closed_loop=False)
 
 
 def _period_end_ns(model: Model, state: State) -> int:

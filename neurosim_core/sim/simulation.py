@@ -24,18 +24,19 @@ from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.render.camera import Lens
 from neurosim_core.scene.bodies import throw_bodies
 from neurosim_core.sim.inputs import (
+    Start,
     as_device_array,
     check_rows,
     checked_mask,
     checked_rows,
     checked_seeds,
     make_seeds,
+    take_seeds,
 )
 from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch, refuse_commands
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.observation import Observation, make_observation
 from neurosim_core.sim.parameters import WorldSettings, check_lenses, lenses_differ, vary_sensors
-from neurosim_core.sim.reset import Start, take_seeds
 from neurosim_core.sim.scene_table import SceneSource, make_scene_table
 from neurosim_core.sim.schedule import PERIOD_COUNT_MAX, Period, Timetable
 from neurosim_core.sim.state import State, make_state, reset_vehicles

@@ -8,7 +8,7 @@ from collections import defaultdict, deque
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -24,19 +24,17 @@ from neurosim_core.sensors.base import (
     SamplerContext,
     StateSensorConfig,
 )
-from neurosim_core.sensors.sampler_checks import make_sampler
-from neurosim_core.sim.inputs import CommandBuffer
+from neurosim_core.sensors.state_sampler import make_sampler
+from neurosim_core.sim.inputs import CommandBuffer, Start, begin_of_paths, restart
 from neurosim_core.sim.kinematic_vehicle import KinematicVehicle
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import WorldSettings
-from neurosim_core.sim.render_group import MakeRoom, RenderGroupState, make_render_groups
-from neurosim_core.sim.reset import Start, begin_of_paths, restart
+from neurosim_core.sim.render_group import PictureAllocator, RenderGroupState, make_render_groups
 from neurosim_core.sim.scene_table import single_scene
 from neurosim_core.sim.schedule import Boundary, boundary_count_max
 from neurosim_core.sim.trace import Trace, WorldArrays, make_surfaces
 from neurosim_core.vehicle import DynamicsError
-from neurosim_core.vehicle.config import VehicleContext
-from neurosim_core.vehicle.host_vehicle import Vehicle
+from neurosim_core.vehicle.base import Vehicle, VehicleContext
 
 if TYPE_CHECKING:
     from neurosim_core.sim.cameras import RenderJob
@@ -91,15 +89,6 @@ class Batch:
     """Renders after which something moves further by the next tick than it should between renders."""
 
 
-class PlannedStep(NamedTuple):
-    """A control period that was planned."""
-
-    batch: Batch
-    """The first of it."""
-    end_ns: int
-    """Where it ends [ns]."""
-
-
 @dataclass(kw_only=True, eq=False)
 class State:
     """What changes during a run."""
@@ -111,7 +100,7 @@ class State:
     worlds: Any
     """The vehicles and the clocks of their worlds as kernels see them (`trace.WorldArrays`)."""
     start: Any
-    """Where vehicles begin, one row for each world (`integrate.Start`)."""
+    """Where vehicles begin, one row for each world (`inputs.Start`)."""
     path_controller: PathController | None
     """None: the path prescribes the motion."""
     trace: Trace
@@ -128,7 +117,7 @@ class State:
     borrow_pictures: bool
     """Pictures are views that the next batch with the same buffers overwrites."""
     pictures_in_place: bool
-    """Pictures for which the caller has room are handed out before the device has finished them."""
+    """Pictures for which the caller has a buffer are handed out before the device has finished them."""
     wanted: frozenset[str]
     """Cameras that look, from the next batch on."""
     flight_stream: wp.Stream | None
@@ -164,8 +153,8 @@ class State:
     command_mode: CommandMode | None = None
     """Mode of the setpoint that the next batch begins with."""
     in_flight: deque[Batch] = field(default_factory=deque)
-    planned: PlannedStep | None = None
-    """The next control period, if it was planned while the device was at work."""
+    planned: Batch | None = None
+    """The first of the next control period, if it was planned while the device was at work."""
     sequence: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     touching: bool = False
     """The vehicle touched the scene at the last boundary."""
@@ -186,7 +175,7 @@ def make_state(
     in_flight: int | None = None,
     render_backlog: int | None = None,
     borrow_pictures: bool = False,
-    make_room: MakeRoom | None = None,
+    allocate_picture: PictureAllocator | None = None,
     seed: int | None = None,
     start: StartState | None = None,
     worlds: WorldSettings | None = None,
@@ -201,7 +190,7 @@ def make_state(
             `in_flight`.
         borrow_pictures: Do not copy pictures: with one batch in flight, each is valid until the next `step`
             or `render_batch`; those that a step would overwrite itself are copied.
-        make_room: Gives memory to copy a picture to, where the caller has a place for it; called before
+        allocate_picture: Gives a buffer to copy a picture to, where the caller has one; called before
             pictures are rendered. Nothing waits for what a device copies there: it is there after `settle`.
         seed: Seed of the sensor noise and of turbulence; None: as configured.
         start: Where the vehicle starts; None: as configured.
@@ -267,7 +256,7 @@ def make_state(
             history=trace.arrays.history,
             in_flight=in_flight,
             on_host=on_host,
-            make_room=make_room,
+            allocate_picture=allocate_picture,
         ),
         samplers=samplers,
         sampler_copies={
@@ -276,11 +265,11 @@ def make_state(
             if on_host
         },
         seeds=seeds,
-        overlaps=on_host and (in_flight > 1 or make_room is not None or not _is_one_graph(model)),
+        overlaps=on_host and (in_flight > 1 or allocate_picture is not None or not _is_one_graph(model)),
         batch_done=[Fence(device) for _ in range(in_flight)],
         render_backlog=render_backlog,
         borrow_pictures=borrow_pictures,
-        pictures_in_place=make_room is not None,
+        pictures_in_place=allocate_picture is not None,
         wanted=frozenset(name for group in model.groups for name in group.names),
         flight_stream=make_stream(device, high_priority=True) if in_flight > 1 else None,
         render_streams=[make_stream(device) if in_flight > 1 else None for _ in range(in_flight)],

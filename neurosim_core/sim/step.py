@@ -19,7 +19,7 @@ from collections.abc import Callable
 from neurosim_core.packets import Packet
 from neurosim_core.runtime.timing import timed
 from neurosim_core.sim.cameras import (
-    acquire_room,
+    acquire_picture_buffers,
     choose,
     find_in_worlds,
     launch_cameras,
@@ -51,7 +51,7 @@ def launch(model: Model, state: State, batch: Batch) -> None:
         # poses of the cameras -> one render of all their instants
         jobs = plan_jobs(state, batch, choose(model, state, batch) if batch.jobs is None else ())
         for job in jobs:
-            acquire_room(job)
+            acquire_picture_buffers(job)
         frames = plan_world_frames(state, batch)
 
         def everything() -> tuple[object, ...]:

@@ -10,7 +10,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.runtime.cuda import HostCopy, RecordedLaunch
-from neurosim_core.scene.freespace import DistanceField, room_around
+from neurosim_core.scene.freespace import DistanceField, clearance_around
 from neurosim_core.vehicle import Multirotor
 from neurosim_core.vehicle.arrays import BLOCK_DIM, STATUS_COLLISION, STATUS_OK, MultirotorArrays
 from neurosim_core.vehicle.history import History, append_history, make_history, motion_at
@@ -101,7 +101,7 @@ def record_state(
         moves * vehicles.body_rate[world],
     )
     field = surfaces.fields[surfaces.scene[world]]
-    clearance = room_around(
+    clearance = clearance_around(
         field, surfaces.radius_m, surfaces.radius_m + field.voxel, surfaces.ground_height_m, position
     )
     rows_out.clearance[slot, world] = clearance

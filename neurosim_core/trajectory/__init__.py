@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import scipy  # which imports its parts when they are used
 from pydantic import Field
 
 from neurosim_core.scene.freespace import FreeSpace
-from neurosim_core.trajectory.feasibility import FlightLimits
 from neurosim_core.trajectory.path import Path
 from neurosim_core.trajectory.planner import (
     CollisionFreeConfig,
@@ -31,7 +30,9 @@ from neurosim_core.trajectory.shapes import (
     line,
     lissajous,
 )
-from neurosim_core.vehicle import MultirotorConfig
+
+if TYPE_CHECKING:
+    from neurosim_core.vehicle import MultirotorConfig
 
 PathConfig = Annotated[
     TourConfig
@@ -52,13 +53,14 @@ __all__ = [
     "PathConfig",
     "PosesConfig",
     "TourConfig",
+    "check_thrust",
     "load_scipy",
     "make_path",
 ]
 
 
-def make_path(config: PathConfig, space: FreeSpace, airframe: MultirotorConfig, *, duration_s: float) -> Path:
-    """Plan the path that a configuration asks for.
+def make_path(config: PathConfig, space: FreeSpace, *, duration_s: float) -> Path:
+    """Plan the path that a configuration asks for; `check_thrust` says whether a vehicle can fly it.
 
     Tours and waypoints are proven to keep their clearance. Closed forms are flown as they are, through walls
     if so asked: collisions in flight are detected by the simulation.
@@ -66,14 +68,11 @@ def make_path(config: PathConfig, space: FreeSpace, airframe: MultirotorConfig, 
     Args:
         config: What to fly.
         space: Where.
-        airframe: What flies; it must be able to give the thrust that the limits allow.
         duration_s: How long the run is [s].
 
     Raises:
-        PlanningError: There is no path, or the limits allow more thrust than the vehicle has.
+        PlanningError: There is no path.
     """
-    if isinstance(config, CollisionFreeConfig):
-        _check_thrust(config.limits, airframe)
     match config:
         case TourConfig():
             return plan_tour(space, config, duration_s=duration_s)
@@ -94,11 +93,19 @@ def make_path(config: PathConfig, space: FreeSpace, airframe: MultirotorConfig, 
 
 
 def load_scipy() -> None:
-    """Import what free space, paths and light take from SciPy, so that it is there when they need it."""
-    _ = scipy.interpolate, scipy.linalg, scipy.ndimage, scipy.optimize, scipy.spatial.transform
+    """Import what free space and paths take from SciPy, so that it is there when they need it."""
+    _ = scipy.interpolate, scipy.linalg, scipy.ndimage, scipy.optimize
 
 
-def _check_thrust(limits: FlightLimits, airframe: MultirotorConfig) -> None:
+def check_thrust(config: PathConfig, airframe: MultirotorConfig) -> None:
+    """Refuse a path whose limits allow more thrust than a vehicle has.
+
+    Raises:
+        PlanningError: They do.
+    """
+    if not isinstance(config, CollisionFreeConfig):
+        return
+    limits = config.limits
     thrust, weight = airframe.thrust_max_n, airframe.hover_thrust_n
     if limits.thrust_to_weight_max * weight > thrust:
         raise PlanningError(

@@ -12,15 +12,12 @@ is halved: L^2 and e fall to a quarter. Distances at the ends are exact, from th
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.scene.freespace import FreeSpace
 from neurosim_core.trajectory.feasibility import bernstein_matrix
-from neurosim_core.trajectory.path import Path, restriction
+from neurosim_core.trajectory.path import restriction
 
 Array = NDArray[np.float64]
 
@@ -29,29 +26,12 @@ _PART_M = 0.15
 _HALVINGS_MAX = 12
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ClearanceProof:
-    """What could be proven about the clearance of a path."""
-
-    holds: NDArray[np.bool_]
-    """Whether each piece is proven to keep the clearance asked for, shape [S]."""
-    clearance_m: float
-    """Proven lower bound of the clearance over all pieces that hold [m]; inf if none does."""
-
-
-def prove_clearance(path: Path, space: FreeSpace, clearance_m: float) -> ClearanceProof:
-    """Prove that every piece of a path keeps a clearance, or say which do not.
+def prove_clearance(coefficients: Array, space: FreeSpace, clearance_m: float) -> NDArray[np.bool_]:
+    """Prove that polynomial pieces keep a clearance, and return for each whether it is proven, shape [S].
 
     A piece fails if some point of it is too near something (the bounds of the scene count), or if it comes so
-    close to the limit (about 1e-5 m) that 12 halvings prove nothing.
-    """
-    return prove_pieces(path.coefficients[:, :3], space, clearance_m)
-
-
-def prove_pieces(coefficients: Array, space: FreeSpace, clearance_m: float) -> ClearanceProof:
-    """Prove the clearance of polynomial pieces; see `prove_clearance`.
-
-    Positions [m] are coefficients in rising powers of normalised time, shape [S, 3, degree + 1].
+    close to the limit (about 1e-5 m) that 12 halvings prove nothing. Positions [m] are coefficients in rising
+    powers of normalised time, shape [S, 3, degree + 1].
     """
     degree = coefficients.shape[2] - 1
     convert = bernstein_matrix(degree)
@@ -63,7 +43,6 @@ def prove_pieces(coefficients: Array, space: FreeSpace, clearance_m: float) -> C
     length = 1.0 / parts[piece]
     start = (np.arange(len(piece)) - first[piece]) * length
     holds = np.ones(len(coefficients), dtype=bool)
-    proven = math.inf
     straight = np.linspace(0.0, 1.0, degree + 1)[:, None]
     for halving in range(_HALVINGS_MAX + 1):
         hull = np.einsum(
@@ -75,7 +54,6 @@ def prove_pieces(coefficients: Array, space: FreeSpace, clearance_m: float) -> C
         excess = np.linalg.norm(hull - (a[:, None] + straight * (b - a)[:, None]), axis=2).max(axis=1)
         bound = segment_clearance(room_a, room_b, np.linalg.norm(b - a, axis=1)) - excess
         good = bound >= clearance_m
-        proven = min(proven, float(bound[good].min(initial=math.inf)))
         bad = ~good & (np.minimum(room_a, room_b) < clearance_m)
         holds[piece[bad]] = False
         open_ = ~good & holds[piece]
@@ -87,7 +65,7 @@ def prove_pieces(coefficients: Array, space: FreeSpace, clearance_m: float) -> C
         half = 0.5 * length[open_]
         start = np.stack([start[open_], start[open_] + half], axis=1).reshape(-1)
         length, piece = np.repeat(half, 2), np.repeat(piece[open_], 2)
-    return ClearanceProof(holds=holds, clearance_m=proven)
+    return holds
 
 
 def segment_clearance(room_a: Array, room_b: Array, length: Array) -> Array:

@@ -24,7 +24,7 @@ from neurosim_core.clock import NS_PER_S
 from neurosim_core.frames import Vector3
 from neurosim_core.scene.freespace import FreeSpace
 from neurosim_core.settings import Settings
-from neurosim_core.trajectory.certify import prove_clearance, prove_pieces
+from neurosim_core.trajectory.certify import prove_clearance
 from neurosim_core.trajectory.feasibility import FlightLimits, flight_bounds, time_factor
 from neurosim_core.trajectory.heading import follow_travel
 from neurosim_core.trajectory.minsnap import allocate_durations, minimum_snap, solve_minimum_snap
@@ -235,7 +235,7 @@ def _entry(terrain: _Terrain, point: Array, *, leg: int, name: str) -> Voxel:
     around = around[np.argsort(np.linalg.norm(around - place, axis=1), kind="stable")]
     if len(around):
         lines = _lines(point[None].repeat(len(around), 0), space.centers(around))
-        clear = np.flatnonzero(prove_pieces(lines, space, terrain.clearance_m + _SPARE_M).holds)
+        clear = np.flatnonzero(prove_clearance(lines, space, terrain.clearance_m + _SPARE_M))
         if len(clear):
             return _voxel(around[clear[0]])
     room = float(space.clearance(point[None])[0])
@@ -272,7 +272,7 @@ def _straighten(terrain: _Terrain, way: Array, *, leg: int) -> Array:
         if chain is None:
             break
         lines = _lines(points[chain[:-1]], points[chain[1:]])
-        holds = prove_pieces(lines, space, terrain.clearance_m + _SPARE_M).holds
+        holds = prove_clearance(lines, space, terrain.clearance_m + _SPARE_M)
         if holds.all():
             return np.asarray(points[chain])
         blocked[np.array(chain[:-1])[~holds], np.array(chain[1:])[~holds]] = True
@@ -332,7 +332,7 @@ def _smooth(terrain: _Terrain, points: Array, config: CollisionFreeConfig) -> Pa
     while True:
         durations = allocate_durations(points, rest=rest)
         spline = solve_minimum_snap(points, durations, rest)
-        holds = prove_pieces(spline.coefficients, terrain.space, config.clearance_m + _SPARE_M).holds
+        holds = prove_clearance(spline.coefficients, terrain.space, config.clearance_m + _SPARE_M)
         if holds.all():
             factor = time_factor(spline.coefficients, durations, config.limits)
             path = follow_travel(
@@ -341,7 +341,7 @@ def _smooth(terrain: _Terrain, points: Array, config: CollisionFreeConfig) -> Pa
                 rate_max_rad_s=config.limits.yaw_rate_max_rad_s,
             )
             # durations were rounded to nanoseconds and pieces were cut: prove what is flown
-            assert prove_clearance(path, terrain.space, config.clearance_m).holds.all()
+            assert prove_clearance(path.coefficients[:, :3], terrain.space, config.clearance_m).all()
             assert flight_bounds(path).within(config.limits)
             return path
         points, rest, splits = _refine(points, rest, splits, ~holds)

@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from neurosim_core.frames import Vector3
 from neurosim_core.settings import Settings
-from neurosim_core.tables import read_table
+from neurosim_core.settings_file import read_table
 from neurosim_core.vehicle.aerodynamics import (
     AIR_TERMS,
     Airframe,

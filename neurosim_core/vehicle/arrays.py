@@ -71,6 +71,15 @@ class MultirotorState(NamedTuple):
     """Speed of each rotor [rad/s], [N, R]."""
 
 
+class Acceleration(NamedTuple):
+    """Accelerations of a batch on the host, float64."""
+
+    linear: NDArray[np.float64]
+    """dv/dt of the centre of mass, in W [m/s^2], [N, 3]."""
+    angular: NDArray[np.float64]
+    """dw/dt in B [rad/s^2], [N, 3]."""
+
+
 class DynamicsError(ArithmeticError):
     """The motion of a vehicle cannot be integrated, or its command was not finite.
 

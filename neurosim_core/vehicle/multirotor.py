@@ -9,11 +9,22 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, ValidationError, model_validator
 
+from neurosim_core.config_errors import explain
 from neurosim_core.frames import as_rows, normalised
+from neurosim_core.registry import register
 from neurosim_core.runtime.cuda import RecordedLaunch
-from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig, alike, make_airframe
-from neurosim_core.vehicle.arrays import BLOCK_DIM, MultirotorState, allocate_arrays, check_status, read_state
+from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig, alike, make_airframe, preset
+from neurosim_core.vehicle.arrays import (
+    BLOCK_DIM,
+    Acceleration,
+    MultirotorState,
+    allocate_arrays,
+    check_status,
+    read_state,
+)
+from neurosim_core.vehicle.base import VehicleConfig, VehicleContext
 from neurosim_core.vehicle.equations import Interval, Surroundings
 from neurosim_core.vehicle.ground import make_ground
 from neurosim_core.vehicle.integrator import make_flight, make_kernels, record_nothing
@@ -25,15 +36,6 @@ Integrator = Literal["rkmk4", "dormand_prince"]
 
 _STEP_MAX_NS = 10**12
 _INTERVAL_COUNT_MAX = 256  # that are kept, one for each duration
-
-
-class Acceleration(NamedTuple):
-    """Accelerations of a batch on the host, float64."""
-
-    linear: NDArray[np.float64]
-    """dv/dt of the centre of mass, in W [m/s^2], [N, 3]."""
-    angular: NDArray[np.float64]
-    """dw/dt in B [rad/s^2], [N, 3]."""
 
 
 class Effort(NamedTuple):
@@ -332,6 +334,54 @@ class Multirotor:
             evaluation_count_max=evaluation_count_max,
         )
         return interval
+
+
+@register("vehicle", "multirotor")
+class MultirotorVehicleConfig(VehicleConfig):
+    """The multirotor that carries the sensors."""
+
+    kind: Literal["multirotor"] = "multirotor"
+    preset: str = "hummingbird"
+    """Name of the airframe: crazyflie, hummingbird or racer."""
+    parameters: dict[str, Any] = Field(default_factory=dict)
+    """Parameters to change, by name (see `MultirotorConfig`), of the airframe, such as {mass_kg: 0.6}, and of
+    what it flies in: {wind_m_s: [3, 0, 0], gusts: [{velocity_m_s: [5, 0, 0], start_s: 1, rise_s: 0.5,
+    hold_s: 2}], turbulence: {wind_20ft_m_s: 7.7}, ground: {height_m: 0, rotor_radius_m: 0.1}}. A gust without
+    hold_s stays for good."""
+    integrator: Integrator = "rkmk4"
+    """rkmk4: fixed steps, and adaptive ones for intervals that these cannot resolve. dormand_prince: adaptive
+    steps only."""
+
+    @model_validator(mode="after")
+    def _airframe_exists(self) -> MultirotorVehicleConfig:
+        try:
+            self.airframe()
+        except ValidationError as error:
+            lines = explain(MultirotorConfig, error)
+            whole = any(not item["loc"] for item in error.errors())
+            before = "parameters: " if whole else "parameters."
+            raise ValueError("; ".join(f"{before}{line}" for line in lines)) from None
+        return self
+
+    @property
+    def title(self) -> str:
+        """Name of the airframe."""
+        return self.preset
+
+    def airframe(self) -> MultirotorConfig:
+        """Return all parameters of the airframe."""
+        return preset(self.preset, **self.parameters)
+
+    def make(self, context: VehicleContext) -> Multirotor:
+        """Return the multirotors of all worlds."""
+        return Multirotor(
+            self.airframe(),
+            count=context.count,
+            device=context.device,
+            max_step_ns=context.max_step_ns,
+            integrator=self.integrator,
+            seeds=context.seeds,
+        )
 
 
 def _check_integer(name: str, value: Any, low: int, high: int) -> None:

@@ -85,8 +85,8 @@ def test_launches_are_others_when_memory_was_pinned_anew(memory, monkeypatch):
     room = np.zeros((2, 3), dtype=np.uint8)
     job: Any = SimpleNamespace(
         pattern="job",
-        group=SimpleNamespace(make_room=True),
-        rooms={("rgb", 0): room},
+        group=SimpleNamespace(allocate_picture=True),
+        picture_buffers={("rgb", 0): room},
         pictures=((0, 0, "rgb"), (5, 1, "rgb")),
     )
     before = launch_key(job)

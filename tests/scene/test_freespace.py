@@ -142,7 +142,7 @@ def _room(
     clearance_out: wp.array[float],
 ) -> None:
     sample = wp.tid()
-    clearance_out[sample] = freespace.room_around(
+    clearance_out[sample] = freespace.clearance_around(
         field, radius_m, exact_below, -wp.float64(wp.inf), position[sample]
     )
 

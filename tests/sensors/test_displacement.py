@@ -248,14 +248,13 @@ def test_the_choice_does_not_depend_on_how_a_flight_is_cut(arrays, cuts):
 
 @pytest.mark.parametrize("moving", [False, True], ids=["still", "body"])
 def test_the_choice_does_not_depend_on_what_a_cpu_does_at_once(arrays, moving, monkeypatch):
-    """Blocks of ticks, ticks that are compared ahead, and threads are a matter of cost."""
+    """Blocks of ticks and threads are a matter of cost."""
     if moving:
         arrays = with_body(size_m=(0.3, 0.2, 0.02), position_m=(0.1, 0.0, 1.0), spin_rad_s=(0.0, 0.0, 3.0))
     states = flight(300, v_W=(0.3, -0.2, 0.5), w_B=(0.2, 0.4, -0.1))
     found = []
-    for block, ahead_min, split_min in ((128, 2, 1 << 14), (300, 300, 1), (64, 1, 1), (7, 16, 1 << 14)):
-        monkeypatch.setattr(displacement, "_BLOCK_ON_CPU", block)
-        monkeypatch.setattr(displacement, "_AHEAD_MIN", ahead_min)
+    for block, split_min in ((128, 1 << 14), (300, 1), (64, 1), (7, 1 << 14)):
+        monkeypatch.setattr(displacement, "_BLOCK", block)
         monkeypatch.setattr(displacement, "_SPLIT_MIN", split_min)
         rule = make_rule(arrays)
         found.append((choose(rule, states, forced={77, 78}), rule.coarse_count))

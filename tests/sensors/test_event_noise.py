@@ -15,8 +15,7 @@ from neurosim_core.config import load_config
 from neurosim_core.packets import EventArrays, Events
 from neurosim_core.sensors import event_pixels
 from neurosim_core.sensors.event_config import EventCameraConfig
-from neurosim_core.sensors.event_kernels import make_noisy_scan
-from neurosim_core.sensors.event_noise_model import terms_of
+from neurosim_core.sensors.event_noise_scan import make_noisy_scan
 from neurosim_core.sensors.events import EventCamera
 from neurosim_core.sim import run
 
@@ -50,7 +49,7 @@ def make_camera(
     **settings: Any,
 ) -> EventCamera:
     config = EventCameraConfig(**settings)
-    needed = set(terms_of(config))
+    needed = set(config.terms())
     terms = next((terms for terms in SHARED_TERMS if shared and needed and needed <= set(terms)), None)
     return EventCamera(
         config, width=width, height=height, device=device, seed=seed, sensor=sensor, terms=terms
@@ -106,14 +105,14 @@ def walk(seed: int = 0, shape: tuple[int, ...] = (12, 15), count: int = 9) -> tu
 def test_what_is_off_is_not_there(device):
     camera = make_camera(15, 12, device, shared=False)
     assert camera.terms == ()
-    assert camera._pixels.noise is None
+    assert camera._pixels.states.models == []
     assert camera._readout is None
     camera = make_camera(15, 12, device, shared=False, leak={}, readout={})
     assert camera.terms == ("leak", "readout")
-    memory = camera._pixels.noise.memories[0]
-    arrays = (memory.reference, memory.filtered, memory.held_ns, memory.next_ns, memory.voltage)
-    assert [array.shape[0] for array in arrays] == [0] * 5
-    assert camera._pixels.noise.model.thresholds.shape[0] == 0
+    state = camera._pixels.states.ring[0]
+    arrays = (state.reference, state.filtered, state.held_ns, state.next_ns, state.voltage)
+    assert [array.shape[1] for array in arrays] == [0] * 5
+    assert camera._pixels.states.models[0].thresholds.shape[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -169,7 +168,7 @@ def test_thresholds_are_normal_and_stay(device):
         assert not low <= 1.1**2 * value.size <= high  # a spread that is 10 % off would be seen
     assert abs(np.corrcoef(measured)[0, 1]) < 4.9 / 128  # independent: normal with deviation 1 / 128
     np.testing.assert_allclose(
-        camera._pixels.noise.model.thresholds.numpy(), np.transpose(measured), atol=1.1e-6
+        camera._pixels.states.models[0].thresholds.numpy(), np.transpose(measured), atol=1.1e-6
     )
     # another camera with this seed and name, wherever it starts, is the same one
     frames = np.stack([np.zeros((128, 128)), np.ones((128, 128))])
@@ -211,7 +210,7 @@ def test_thresholds_are_clipped_to_their_minimum(device):
     """With a deviation of half the mean, a normal share of Phi((0.05 - 0.2) / 0.1) lies at the minimum."""
     spread = {"sigma_on": 0.1, "sigma_off": 0.0, "minimum": 0.05}
     camera = make_camera(128, 128, device, threshold_spread=spread)
-    on, off = camera._pixels.noise.model.thresholds.numpy().T
+    on, off = camera._pixels.states.models[0].thresholds.numpy().T
     assert on.min() == 0.05
     assert np.all(off == 0.2)
     low, high = stats.binom(128**2, stats.norm.cdf(-1.5)).interval(1.0 - ALARM)
@@ -379,7 +378,7 @@ def test_leak_rate_of_a_still_scene(device):
     stamps = np.arange(0, 20 * S + 1, S // 10)
     found = still(camera, -1.3, stamps)
     assert np.all(found.polarity == 1)
-    rate, phase = camera._pixels.noise.model.leak.numpy().T
+    rate, phase = camera._pixels.states.models[0].leak.numpy().T
     rate_hz = rate * 1e9
     assert stats.kstest(np.log10(rate_hz), stats.norm(math.log10(2.0), 0.1).cdf).pvalue > ALARM
     assert stats.kstest(phase, stats.uniform.cdf).pvalue > ALARM

@@ -10,7 +10,6 @@ import yaml
 
 from neurosim_core.config import ConfigError, SimulationConfig, load_config, to_yaml
 from neurosim_core.sensors.event_config import EventCameraConfig, LeakConfig, event_presets
-from neurosim_core.sensors.event_noise_model import terms_of
 from neurosim_core.sensors.events import EventCamera
 
 
@@ -27,7 +26,7 @@ def test_presets_survive_a_file(name):
     config = load({"preset": name})
     pixel = pixel_of(config)
     assert pixel == EventCameraConfig(preset=name)
-    assert terms_of(pixel) or pixel.readout is not None
+    assert pixel.terms() or pixel.readout is not None
     for comments in (False, True):
         assert load_config(yaml.safe_load(to_yaml(config, comments=comments))) == config
     assert len(event_presets()[name]["sources"]) > 20
@@ -44,7 +43,7 @@ def test_contrasts_are_logarithms():
 def test_v2e_is_as_published():
     """`set_dvs_params` of its code: clean has mismatch alone, noisy no refractory time."""
     clean, noisy = (EventCameraConfig(preset=f"v2e_{name}") for name in ("clean", "noisy"))
-    assert terms_of(clean) == ("spread", "lin_log")
+    assert clean.terms() == ("spread", "lin_log")
     assert (clean.threshold_on, clean.threshold_off, clean.threshold_spread.sigma_on) == (0.2, 0.2, 0.02)
     assert (noisy.threshold_on, noisy.threshold_off, noisy.threshold_spread.sigma_off) == (0.2, 0.2, 0.05)
     assert (noisy.low_pass.cutoff_hz, noisy.leak.rate_hz, noisy.shot_noise.rate_hz) == (30.0, 0.1, 4.7273)
@@ -104,7 +103,7 @@ def test_shot_noise_of_v2e_goes_with_the_threshold(device):
     camera.reset(np.zeros((64, 64), np.float32))
     events = camera.feed(np.zeros((1, 64, 64), np.float32), [20_000_000_000]).numpy()
     pixel = events.y.astype(int) * 64 + events.x
-    threshold = camera._pixels.noise.model.thresholds.numpy()
+    threshold = camera._pixels.states.models[0].thresholds.numpy()
     for column, polarity in ((0, 1), (1, 0)):
         count = np.bincount(pixel[events.polarity == polarity], minlength=64 * 64)
         expected = 20.0 * 20.0 * 0.2 / threshold[:, column]

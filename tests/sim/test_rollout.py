@@ -383,7 +383,7 @@ def test_pictures_are_the_same_where_the_caller_has_room(outside_model):
     rooms: list[np.ndarray] = []
     asked: list[str] = []
 
-    def make_room(name: str, stamp_ns: int, picture: np.ndarray) -> np.ndarray | None:
+    def allocate_picture(name: str, stamp_ns: int, picture: np.ndarray) -> np.ndarray | None:
         asked.append(name)
         if len(asked) % 2:
             return None
@@ -398,7 +398,7 @@ def test_pictures_are_the_same_where_the_caller_has_room(outside_model):
         return packets
 
     expected = fly_all(sim.make_state(model, render_backlog=32))
-    packets = fly_all(sim.make_state(model, render_backlog=32, make_room=make_room))
+    packets = fly_all(sim.make_state(model, render_backlog=32, allocate_picture=allocate_picture))
     assert content(packets) == content(expected)
     pictures = [packet for packet in packets if isinstance(packet, Image)]
     assert len(pictures) == len(asked) > 4
@@ -496,11 +496,11 @@ def test_a_device_writes_pictures_into_room_of_the_caller(settings, monkeypatch,
     expected = [p for _ in range(10) for p in sim.step(model, together, command)]
     rooms: list[np.ndarray] = []
 
-    def make_room(name: str, stamp_ns: int, picture: np.ndarray) -> np.ndarray | None:
+    def allocate_picture(name: str, stamp_ns: int, picture: np.ndarray) -> np.ndarray | None:
         rooms.append(np.full_like(picture, 77))
         return rooms[-1]
 
-    state = sim.make_state(model, make_room=make_room)
+    state = sim.make_state(model, allocate_picture=allocate_picture)
     packets = []
     unfinished_count = 0
     for _ in range(10):

@@ -14,7 +14,7 @@ from world_rig import RIG, UNSHADOWED, assert_same, commands_of, fly_alone, room
 import neurosim_core as ns
 from neurosim_core.packets import Collision, Events
 from neurosim_core.render import launch, scene_arrays
-from neurosim_core.sensors import event_worlds
+from neurosim_core.sensors import event_pixels, event_worlds
 from neurosim_core.sim import Simulation, StartState
 from neurosim_core.sim import simulation as worlds_module
 from neurosim_core.vehicle.arrays import STATUS_TERMS
@@ -381,7 +381,7 @@ def test_neither_batch_nor_threads_change_a_byte(plain, monkeypatch):
     commands = commands_of("rates", 4, 4)
     together = record(Simulation(settings(plain, sensors=rig), worlds=4), commands)
     for cores in (1, 3):
-        for module in (launch, event_worlds):
+        for module in (launch, event_pixels, event_worlds):
             monkeypatch.setattr(module, "core_count", lambda cores=cores: cores)
         for first in (0, 2):
             half = Simulation(settings(plain, sensors=rig), worlds=2, seeds=[7 + first, 8 + first])
@@ -562,7 +562,7 @@ def test_patterns_that_never_come_again(plain, monkeypatch, caplog):
     worlds = Simulation(config, worlds=1)
     seen = record(worlds, commands)
     assert len(worlds._observations) <= 3
-    assert len(worlds._state.groups[0].world_frames["front"]._offsets_ns) <= 3
+    assert worlds._state.groups[0].world_frames["front"].offsets.cache_info().currsize <= 3
     packets = [p for step in fly_alone(config, commands[:, 0]) for p in step]
     found = [p.numpy() for p in packets if isinstance(p, Events)]
     for column, expected in zip(in_order([s[0]["front"] for s in seen]), in_order(found), strict=True):

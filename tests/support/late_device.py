@@ -16,9 +16,9 @@ import numpy as np
 import warp as wp
 
 from neurosim_core.runtime import cuda
-from neurosim_core.sensors import event_keys, event_noise, event_pixels, event_readout, event_states, events
+from neurosim_core.sensors import event_keys, event_noise, event_pixels, event_readout, events
 
-_MODULES = (cuda, events, event_keys, event_pixels, event_states, event_readout)
+_MODULES = (cuda, events, event_keys, event_noise, event_pixels, event_readout)
 
 
 class LateStream:
@@ -102,6 +102,15 @@ class LateDevice(str):
         return stream
 
 
+def _packed(value: Any) -> Any:
+    """Return a parameter of a launch as it is now: Warp packs structs when it launches."""
+    if not hasattr(value, "_cls"):
+        return value
+    packed = value._cls()
+    packed.assign(value)
+    return packed
+
+
 class _LateWarp:
     """Warp, with what it launches put off."""
 
@@ -123,6 +132,8 @@ class _LateWarp:
 
     def launch(self, *args: Any, device: Any, **kwargs: Any) -> None:
         if isinstance(device, LateDevice):
+            for given in (kwargs.get("inputs", []), kwargs.get("outputs", [])):
+                given[:] = map(_packed, given)
             self._device.add(lambda: wp.launch(*args, device=device, **kwargs))
         else:  # a launch of the host, as the arbiter's
             wp.launch(*args, device=device, **kwargs)
@@ -202,10 +213,8 @@ def install(monkeypatch: Any, device: LateDevice) -> None:
         self._row_size = array.size // array.shape[0] if array.size else 0
         self._places = {}
 
-    # noise and arbiters begin at once, from arrays that are ready
-    noise, readout = event_noise.PixelNoise, event_readout.Readout
-    for owner, name in ((noise, "_draw"), (readout, "reset")):
-        monkeypatch.setattr(owner, name, after_all(getattr(owner, name)))
+    # arbiters begin at once, from arrays that are ready
+    monkeypatch.setattr(event_readout.Readout, "reset", after_all(event_readout.Readout.reset))
     numpy, zero, fill = wp.array.numpy, wp.array.zero_, wp.array.fill_
 
     def late_numpy(array: Any) -> Any:

@@ -18,7 +18,7 @@ from neurosim_core.live.messages import command_of
 from neurosim_core.live.simulator import Simulator
 from neurosim_core.live.topics import COMMANDS, SERVICES, command_topic
 from neurosim_core.sim import Model, make_fleet
-from neurosim_core.vehicle.config import MultirotorVehicleConfig
+from neurosim_core.vehicle.multirotor import MultirotorVehicleConfig
 
 IMU = {"kind": "imu", "rate_hz": 400.0, "accelerometer_noise_density": 0.01}
 RGB = {"kind": "rgb", "rate_hz": 50.0, "lens": {"width": 64, "height": 48, "horizontal_fov_rad": 1.5}}

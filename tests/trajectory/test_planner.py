@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
 from neurosim_core.scene.freespace import FreeSpace, FreeSpaceConfig, make_free_space
 from neurosim_core.scene.scene import Scene
-from neurosim_core.trajectory import Path, TourConfig, make_path
+from neurosim_core.trajectory import Path, TourConfig, check_thrust, make_path
 from neurosim_core.trajectory.certify import prove_clearance, segment_clearance
 from neurosim_core.trajectory.feasibility import FlightLimits, flight_bounds
 from neurosim_core.trajectory.minsnap import minimum_snap
@@ -119,7 +119,7 @@ def test_tours_are_clear_long_enough_and_within_limits(rooms, seed):
     path = plan_tour(rooms, config, duration_s=4.0)
     assert path.end_ns >= 4 * 10**9
     assert least_clearance(path, rooms) >= 0.3
-    assert prove_clearance(path, rooms, 0.3).clearance_m >= 0.3
+    assert prove_clearance(path.coefficients[:, :3], rooms, 0.3).all()
     assert flight_bounds(path).within(config.limits)
     stamps = np.linspace(0, path.end_ns, 500).astype(np.int64)
     p = path.evaluate(stamps).position
@@ -181,10 +181,8 @@ def test_a_proof_fails_where_a_path_comes_too_close(rooms):
     middle = corner + 0.35 * np.array([-1.0, 1.0]) / np.sqrt(2.0)
     a, b = middle - 0.8 * direction, middle + 0.8 * direction
     path = minimum_snap([[*a, 1.2], [*b, 1.2]], [0, 10**9])
-    assert prove_clearance(path, rooms, 0.3499).holds.all()
-    assert not prove_clearance(path, rooms, 0.3501).holds.any()
-    proof = prove_clearance(path, rooms, 0.3)
-    assert 0.3 <= proof.clearance_m <= 0.35 + 1e-6
+    assert prove_clearance(path.coefficients[:, :3], rooms, 0.3499).all()
+    assert not prove_clearance(path.coefficients[:, :3], rooms, 0.3501).any()
 
 
 def test_a_proof_sees_the_curve_and_not_its_chords(rooms):
@@ -193,15 +191,15 @@ def test_a_proof_sees_the_curve_and_not_its_chords(rooms):
     height = [0.5 + 3.0 * tip**2, -6.0 * tip, 3.0]
     coefficients = [[1.0, 1.0, 0.0], [1.0, 0.0, 0.0], height, [0.0, 0.0, 0.0]]
     path = Path(np.array([0, 10**9]), np.array([coefficients]))
-    assert prove_clearance(path, rooms, 0.4999).holds.all()
-    assert not prove_clearance(path, rooms, 0.5003).holds.any()
+    assert prove_clearance(path.coefficients[:, :3], rooms, 0.4999).all()
+    assert not prove_clearance(path.coefficients[:, :3], rooms, 0.5003).any()
 
 
 def test_a_proof_sees_what_samples_miss():
     """A wire between two samples: both ends have room, the line between them does not."""
     space = as_space(ROOMS, box((4.0, 2.5, 0.0), (4.002, 2.502, 2.5)))
     path = minimum_snap([[3.6, 2.501, 1.2], [4.4, 2.501, 1.2]], [0, 10**9])
-    assert not prove_clearance(path, space, 0.05).holds.any()
+    assert not prove_clearance(path.coefficients[:, :3], space, 0.05).any()
 
 
 def test_segments_keep_the_clearance_that_points_allow():
@@ -220,14 +218,18 @@ def test_segments_keep_the_clearance_that_points_allow():
 
 
 def test_make_path_chooses_by_kind(rooms):
-    airframe = preset("hummingbird")
-    assert make_path(HoverConfig(), rooms, airframe, duration_s=4.0).length_m == 0.0
+    assert make_path(HoverConfig(), rooms, duration_s=4.0).length_m == 0.0
     line = LineConfig(start_m=(1.0, 1.0, 1.0), end_m=(2.0, 1.0, 1.0))
-    assert make_path(line, rooms, airframe, duration_s=4.0).length_m == pytest.approx(1.0)
-    assert make_path(TourConfig(), rooms, airframe, duration_s=1.0).end_ns >= 10**9
-    strong = TourConfig(limits=FlightLimits(thrust_to_weight_max=50.0))
+    assert make_path(line, rooms, duration_s=4.0).length_m == pytest.approx(1.0)
+    assert make_path(TourConfig(), rooms, duration_s=1.0).end_ns >= 10**9
+
+
+def test_a_path_may_ask_for_no_more_thrust_than_the_vehicle_has():
+    airframe = preset("hummingbird")
+    check_thrust(TourConfig(), airframe)
+    check_thrust(HoverConfig(), airframe)
     with pytest.raises(PlanningError, match="thrust_to_weight_max = 50 is more than the vehicle has"):
-        make_path(strong, rooms, airframe, duration_s=1.0)
+        check_thrust(TourConfig(limits=FlightLimits(thrust_to_weight_max=50.0)), airframe)
 
 
 def test_configuration_refuses_nonsense():

@@ -9,8 +9,7 @@ import pytest
 
 import neurosim_core as ns
 from neurosim_core.vehicle import Acceleration, MultirotorState
-from neurosim_core.vehicle.config import VehicleConfig
-from neurosim_core.vehicle.host_vehicle import HostVehicle
+from neurosim_core.vehicle.base import HostVehicle, VehicleConfig
 
 
 @ns.register("vehicle", "stone")

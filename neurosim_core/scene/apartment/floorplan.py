@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from neurosim_core.scene.apartment.draws import stream
-from neurosim_core.tables import read_table
+from neurosim_core.settings_file import read_table
 
 if TYPE_CHECKING:
     from neurosim_core.scene.apartment.apartment import ApartmentConfig

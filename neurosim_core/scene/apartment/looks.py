@@ -13,7 +13,7 @@ from neurosim_core.scene.apartment import pictures, textures
 from neurosim_core.scene.apartment.draws import stream
 from neurosim_core.scene.apartment.floorplan import Role
 from neurosim_core.scene.scene import LinearRgb
-from neurosim_core.tables import read_table
+from neurosim_core.settings_file import read_table
 
 
 @dataclass(frozen=True, kw_only=True)

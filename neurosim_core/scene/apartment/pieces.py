@@ -32,7 +32,7 @@ from neurosim_core.scene.apartment.looks import Surface
 from neurosim_core.scene.apartment.pictures import SPINE_COLUMNS, SPINE_ROWS
 from neurosim_core.scene.scene import Light
 from neurosim_core.scene.solids import Array, Part, turned
-from neurosim_core.tables import read_table
+from neurosim_core.settings_file import read_table
 
 _WARM = np.array([1.5, 1.35, 1.14])
 """Intensity of a lamp of strength 1: walls and floors of furnished rooms get a radiance of 0.2 to 0.6."""

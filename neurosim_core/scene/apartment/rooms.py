@@ -13,7 +13,7 @@ from neurosim_core.scene.apartment.floorplan import Room, Wall
 from neurosim_core.scene.apartment.furnishing import WALL_GAP_M, RoomSpace
 from neurosim_core.scene.apartment.looks import Finish, Palette
 from neurosim_core.scene.apartment.pieces import FUNCTIONS, Piece, evaluate, make_piece
-from neurosim_core.tables import read_table
+from neurosim_core.settings_file import read_table
 
 if TYPE_CHECKING:
     from neurosim_core.scene.apartment.apartment import ApartmentConfig

@@ -11,11 +11,11 @@ for (int begin = first / SIZE * SIZE; begin < end; begin += SIZE) {
         value[i] = *at;
         if (begin + i + 1 < end) at += stride;
     }
-    unsigned loud = 0;
+    unsigned active = 0;
 #pragma unroll
-    for (int i = 0; i < SIZE; ++i) loud |= (value[i] > low && value[i] < high ? 0u : 1u) << i;
-    if (begin < first) loud &= ~0u << (first - begin);
-    if (loud != 0) return wp::min(begin + __ffs(loud) - 1, end);
+    for (int i = 0; i < SIZE; ++i) active |= (value[i] > low && value[i] < high ? 0u : 1u) << i;
+    if (begin < first) active &= ~0u << (first - begin);
+    if (active != 0) return wp::min(begin + __ffs(active) - 1, end);
 }
 return end;
 #else

@@ -1,24 +1,68 @@
 # mypy: disable-error-code="attr-defined"
-"""What the engine asks of a vehicle, and the base of those that are computed in Python on the host."""
+"""What every kind of vehicle is: its settings, what the engine asks of it, and a base for those in Python."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
+from pydantic import Field
 
+from neurosim_core.settings import Settings
 from neurosim_core.vehicle.airframe import MultirotorConfig
 from neurosim_core.vehicle.arrays import (
     STATUS_BODY_RATE,
     STATUS_VELOCITY,
+    Acceleration,
     MultirotorArrays,
     MultirotorState,
     allocate_arrays,
 )
-from neurosim_core.vehicle.config import VehicleContext
-from neurosim_core.vehicle.multirotor import Acceleration
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VehicleContext:
+    """What a vehicle is made for."""
+
+    count: int
+    """How many worlds there are, each with one."""
+    device: str
+    """Where its state has to be."""
+    max_step_ns: int
+    """Longest integration step [ns]."""
+    seeds: Any
+    """Seed of each world, device array of uint64, shape [N]."""
+
+
+class VehicleConfig(Settings):
+    """Settings that all vehicles have. A kind adds its `kind`, what it needs, `airframe` and `make`."""
+
+    kind: str
+    """Under which name the class is registered."""
+    max_step_s: Annotated[float, Field(ge=1e-6, le=0.1)] = 0.001
+    """Longest integration step [s]; intervals end exactly on control and sensor stamps."""
+    collision_radius_m: Annotated[float, Field(gt=0.0)] = 0.2
+    """Radius of the sphere around the vehicle that must not touch the scene [m]. Where `parameters.ground`
+    is set, the sphere shrinks near that plane to end 1 cm above it: to land is no collision."""
+    on_collision: Literal["end", "report"] = "end"
+    """end: the run stops at the first touch; report: it flies on, through things, and yields Collision
+    packets."""
+
+    @property
+    def title(self) -> str:
+        """What to call it where people read."""
+        return self.kind
+
+    def airframe(self) -> MultirotorConfig:
+        """Return what planners, controllers and IMUs take the vehicle for: mass, inertia, rotors, ranges."""
+        raise NotImplementedError
+
+    def make(self, context: VehicleContext) -> Vehicle:
+        """Return the vehicles of all worlds."""
+        raise NotImplementedError
 
 
 class Vehicle(Protocol):

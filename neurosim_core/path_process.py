@@ -1,0 +1,92 @@
+"""Plans paths in a process of its own, which imports SciPy while the one that asks imports all else."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+import subprocess
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from neurosim_core.runtime.child import begin_child, end_child, start_child
+
+if TYPE_CHECKING:
+    from neurosim_core.frames import Vector3
+    from neurosim_core.scene.freespace import FreeSpace, FreeSpaceConfig
+    from neurosim_core.trajectory import Path, PathConfig
+
+
+class NotPlannedError(Exception):
+    """The process has not planned the paths that are asked for; who plans them here is told what is wrong."""
+
+
+class PlanningProcess:
+    """A process that plans paths, once. A context manager, which ends it."""
+
+    def __init__(self) -> None:
+        self._process = start_child(__name__, stdin=subprocess.PIPE, env={"CUDA_VISIBLE_DEVICES": ""})
+
+    def plan(
+        self,
+        unseeded: FreeSpace,
+        config: FreeSpaceConfig,
+        flights: Sequence[tuple[PathConfig, float]],
+        *,
+        inside_m: Vector3 | None,
+    ) -> tuple[FreeSpace, list[Path]]:
+        """Return what `choose_seed` does, and the path that `make_path` plans there for each flight.
+
+        Args:
+            unseeded: See `choose_seed`.
+            config: See `choose_seed`.
+            flights: Configuration of each path, and how long it is flown at least [s].
+            inside_m: See `choose_seed`.
+
+        Raises:
+            NotPlannedError: The process has ended, because there is no such path or for any other reason.
+        """
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        try:
+            names = {field.name for field in dataclasses.fields(unseeded)} - {"arrays", "mesh", "device"}
+            grid = {name: getattr(unseeded, name) for name in names}
+            triangles = unseeded.mesh.points.numpy(), unseeded.mesh.indices.numpy()
+            request = (grid, triangles, config, flights, inside_m)
+            pickle.dump(request, self._process.stdin, protocol=5)
+            self._process.stdin.flush()
+            seed_m, notes, paths = pickle.load(self._process.stdout)
+        except (EOFError, OSError, pickle.UnpicklingError):
+            raise NotPlannedError from None
+        return dataclasses.replace(unseeded, seed_m=seed_m, notes=notes), paths
+
+    def __enter__(self) -> PlanningProcess:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        end_child(self._process)
+
+
+def main() -> None:
+    """Be the process."""
+    with begin_child() as answers:
+        import warp as wp
+
+        from neurosim_core.scene.freespace import DistanceField, FreeSpace, choose_seed
+        from neurosim_core.trajectory import load_scipy, make_path
+        from neurosim_core.warp_start import start_warp
+
+        start_warp()
+        load_scipy()
+        grid, (points, indices), config, flights, inside_m = pickle.load(sys.stdin.buffer)
+        mesh = wp.Mesh(
+            points=wp.array(points, dtype=wp.vec3, device="cpu"),
+            indices=wp.array(indices, dtype=wp.int32, device="cpu"),
+            bvh_constructor="median",  # built faster than others, and few points are asked for
+        )
+        arrays = DistanceField()  # kernels that plan paths read no distances of the grid
+        arrays.mesh = mesh.id
+        unseeded = FreeSpace(**grid, arrays=arrays, mesh=mesh, device="cpu")
+        space = choose_seed(unseeded, config, inside_m=inside_m)
+        paths = [make_path(path, space, duration_s=duration_s) for path, duration_s in flights]
+        pickle.dump((space.seed_m, space.notes, paths), answers)
