@@ -71,3 +71,14 @@ def test_seconds_round_to_the_nearest_nanosecond():
     assert to_ns(4.0) == 4 * 10**9
     with pytest.raises(ValueError, match="finite"):
         to_ns(float("nan"))
+
+
+@pytest.mark.parametrize("rate_hz", [20.0, 30.0, 333.0, 500.0, 1000.0])
+@pytest.mark.parametrize("other_hz", [30.0, 100.0, 333.0])
+def test_ticks_within_a_period_of_another_clock(rate_hz, other_hz):
+    """No period has more; the one with most has as many, or one less. Of a multiple all have as many."""
+    rate, other = Rate(rate_hz), Rate(other_hz)
+    counts = [len(list(rate.stamps(other.stamp_ns(k) + 1, other.stamp_ns(k + 1) + 1))) for k in range(1000)]
+    assert rate.ticks_within(other) - 1 <= max(counts) <= rate.ticks_within(other)
+    if rate.contains(other):
+        assert set(counts) == {rate.ticks_within(other)}

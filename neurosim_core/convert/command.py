@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from neurosim_core.overrides import add_set_option, read_settings
 from neurosim_core.settings_file import nested
@@ -22,48 +22,48 @@ _HALVED_LOSS_MAX = 0.15
 _BURST_SHARE_MAX = 0.5
 
 
-class _Option(NamedTuple):
-    setting: str
-    """The setting that the option is."""
-    help: str
-    metavar: str | None = None
-    type: Callable[[str], Any] = str
-    choices: tuple[str, ...] | None = None
-
-
-_OPTIONS = {
-    "preset": _Option("pixel.preset", "pixels of a sensor: davis346, imx636, v2e_noisy, ...", "NAME"),
-    "size": _Option(
-        "size", "resolution of the sensor; `preset`: that of the preset (default: as it is)", "WxH"
-    ),
-    "crop": _Option("crop", "take this part of the picture", "WxH+X+Y"),
-    "fit": _Option(
-        "fit", "where --size has another shape (default: crop the middle)", choices=("crop", "stretch")
-    ),
-    "fps": _Option("fps", "frames a second; needed for folders, else as the video says", "HZ", float),
-    "timestamps": _Option("timestamps", "time of each frame, one a line, instead of --fps", "FILE"),
-    "time-unit": _Option(
-        "time_unit",
-        "of --timestamps (default: seconds), or of events in a text, NPZ or HDF5 file that does not say it",
-        choices=("s", "ms", "us", "ns"),
-    ),
-    "slow-motion": _Option(
-        "slow_motion",
-        "how much slower than the world the video runs: 8 if filmed at 240 Hz and played at 30",
-        "FACTOR",
-        float,
-    ),
-    "transfer": _Option(
-        "transfer", "how numbers become light: srgb, bt709, linear, pq, ... (default: auto)", "NAME"
-    ),
-    "dark-floor": _Option(
-        "dark_floor",
-        "added before the logarithm; white is 1 (default: 0.001, or what it takes for a step of the stored "
-        "numbers to be half a threshold at most)",
-        "L",
-        float,
-    ),
-    "seed": _Option("seed", "seed of the noise of the pixels", None, int),
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "preset": {
+        "dest": "pixel.preset",
+        "help": "pixels of a sensor: davis346, imx636, v2e_noisy, ...",
+        "metavar": "NAME",
+    },
+    "size": {
+        "help": "resolution of the sensor; `preset`: that of the preset (default: as it is)",
+        "metavar": "WxH",
+    },
+    "crop": {"help": "take this part of the picture", "metavar": "WxH+X+Y"},
+    "fit": {
+        "help": "where --size has another shape (default: crop the middle)",
+        "choices": ("crop", "stretch"),
+    },
+    "fps": {
+        "help": "frames a second; needed for folders, else as the video says",
+        "type": float,
+        "metavar": "HZ",
+    },
+    "timestamps": {"help": "time of each frame, one a line, instead of --fps", "metavar": "FILE"},
+    "time-unit": {
+        "help": "of --timestamps (default: seconds), or of events in a text, NPZ or HDF5 file that does not "
+        "say it",
+        "choices": ("s", "ms", "us", "ns"),
+    },
+    "slow-motion": {
+        "help": "how much slower than the world the video runs: 8 if filmed at 240 Hz and played at 30",
+        "metavar": "FACTOR",
+        "type": float,
+    },
+    "transfer": {
+        "help": "how numbers become light: srgb, bt709, linear, pq, ... (default: auto)",
+        "metavar": "NAME",
+    },
+    "dark-floor": {
+        "help": "added before the logarithm; white is 1 (default: 0.001, or what it takes for a step of the "
+        "stored numbers to be half a threshold at most)",
+        "metavar": "L",
+        "type": float,
+    },
+    "seed": {"help": "seed of the noise of the pixels", "type": int},
 }
 
 
@@ -80,14 +80,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("source", type=Path, help="video file, folder of pictures, or file of events")
     parser.add_argument("out", type=Path, help="file to write; HDF5 for videos and pictures")
     for name, option in _OPTIONS.items():
-        parser.add_argument(
-            f"--{name}",
-            help=option.help,
-            metavar=option.metavar,
-            type=option.type,
-            choices=option.choices,
-            dest=option.setting,
-        )
+        parser.add_argument(f"--{name}", **option)
     events = parser.add_argument_group("events to another format")
     events.add_argument("--from", dest="source_format", metavar="FORMAT", help="default: by the suffix")
     events.add_argument("--to", dest="out_format", metavar="FORMAT", help="default: by the suffix")
@@ -97,6 +90,11 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--overwrite", action="store_true", help="replace a file that is there")
     add_set_option(parser, "any setting by its dotted key, such as pixel.threshold_on=0.15; may be repeated")
     parser.set_defaults(command=_convert)
+
+
+def _setting(option: str) -> str:
+    """Return the dotted key of the setting that an option is."""
+    return str(_OPTIONS[option].get("dest", option.replace("-", "_")))
 
 
 def _convert(arguments: argparse.Namespace) -> int:
@@ -109,7 +107,7 @@ def _convert(arguments: argparse.Namespace) -> int:
 
 def _check_options(arguments: argparse.Namespace, *, is_events: bool) -> None:
     """Refuse options that do nothing with what is converted."""
-    films = {name: option.setting for name, option in _OPTIONS.items() if name not in ("size", "time-unit")}
+    films = {name: _setting(name) for name in _OPTIONS if name not in ("size", "time-unit")}
     events = {"to": "out_format", "sensor": "sensor", "from-zero": "from_zero"}
     others = films | {"set": "settings"} if is_events else events
     values = {name: getattr(arguments, key) for name, key in others.items()}
@@ -218,12 +216,12 @@ def read_config(arguments: argparse.Namespace) -> ConversionConfig:
     from neurosim_core.config_errors import explain
     from neurosim_core.convert.convert import ConversionConfig
 
-    given = {option.setting: getattr(arguments, option.setting) for option in _OPTIONS.values()}
+    given = {_setting(name): getattr(arguments, _setting(name)) for name in _OPTIONS}
     settings = {key: value for key, value in given.items() if value is not None}
     more = read_settings(arguments.settings)
-    for name, option in _OPTIONS.items():
-        if option.setting in settings and option.setting in more:
-            raise ValueError(f"{option.setting} is given twice: --{name} and --set {option.setting}=...")
+    for name in _OPTIONS:
+        if (key := _setting(name)) in settings and key in more:
+            raise ValueError(f"{key} is given twice: --{name} and --set {key}=...")
     settings |= more
     if "time_unit" in settings and "timestamps" not in settings:
         raise ValueError("--time-unit is that of --timestamps, which are not given")

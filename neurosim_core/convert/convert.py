@@ -449,6 +449,9 @@ def _header(
     }
     settings = {"kind": "event_camera", "pixel": config.pixel.model_dump(mode="json")}
     rate_hz = (len(first.stamps_ns) - 1) * NS_PER_S / int(first.stamps_ns[-1])
+    camera = SensorDescription(
+        name=SENSOR, kind="event_camera", rate_hz=rate_hz, settings=json.dumps(settings)
+    )
     return RecordingHeader(
         config_yaml=yaml.safe_dump(
             {"conversion": {**config.model_dump(mode="json"), **seen}}, sort_keys=False
@@ -456,14 +459,5 @@ def _header(
         seed=config.seed,
         version=__version__,
         scene=source.name,
-        sensors=(
-            SensorDescription(
-                name=SENSOR,
-                kind="event_camera",
-                rate_hz=rate_hz,
-                position=np.zeros(3),
-                orientation=np.array([0.0, 0.0, 0.0, 1.0]),
-                settings=json.dumps(settings),
-            ),
-        ),
+        sensors=(camera,),
     )

@@ -67,11 +67,10 @@ def open_source(
     `fps`: frames a second; for a video instead of the times in it [Hz]. `stamps_ns`: times of the frames
     [ns], in place of `fps`. `transfer`: name of the transfer function; auto: what the file says, else sRGB.
     """
-    if path.is_dir():
-        return FolderSource(path, fps=fps, stamps_ns=stamps_ns, transfer=transfer)
     if not path.exists():
         raise FileNotFoundError(f"no file or folder {path}")
-    return VideoSource(path, fps=fps, stamps_ns=stamps_ns, transfer=transfer)
+    clock = _Clock(fps=fps, stamps_ns=stamps_ns, path=path)
+    return FolderSource(path, clock, transfer) if path.is_dir() else VideoSource(path, clock, transfer)
 
 
 def read_stamps(path: Path, *, unit: str = "s") -> list[int]:
@@ -108,10 +107,6 @@ class _Clock:
             raise ValueError("frames have a rate or a list of times, not both")
         self._rate = None if self.fps is None else Rate(self.fps)
 
-    @property
-    def known(self) -> bool:
-        return self._rate is not None or self.stamps_ns is not None
-
     def stamp_ns(self, frame: int, *, shown_s: Fraction | None = None) -> int:
         """Return the time of a frame, given the time that the file has for it."""
         if self._rate is not None:
@@ -141,30 +136,23 @@ class FolderSource:
     the last are taken as linear light. See `open_source` for arguments.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        fps: float | None = None,
-        stamps_ns: Sequence[int] | None = None,
-        transfer: str = "auto",
-    ) -> None:
+    def __init__(self, path: Path, clock: _Clock, transfer: str) -> None:
         self._files = sorted(
             (f for f in path.iterdir() if f.suffix.lower() in SUFFIXES and not f.name.startswith(".")),
             key=lambda file: _natural(file.name),
         )
         if not self._files:
             raise ValueError(f"{path} has no pictures; names must end in one of {', '.join(SUFFIXES)}")
-        self._clock = _Clock(fps=fps, stamps_ns=stamps_ns, path=path)
-        if not self._clock.known:
+        self._clock = clock
+        if clock.fps is None and clock.stamps_ns is None:
             raise ValueError(f"{path} is a folder: its pictures have no times; give --fps or --timestamps")
-        if stamps_ns is not None and len(stamps_ns) != len(self._files):
-            raise ValueError(f"{path} has {len(self._files)} pictures, got {len(stamps_ns)} times")
-        self._transfer = "srgb" if transfer == "auto" else transfer
-        self._tables = {bits: LightTables(self._transfer, bits=bits) for bits in (8, 16)}
+        if clock.stamps_ns is not None and len(clock.stamps_ns) != len(self._files):
+            raise ValueError(f"{path} has {len(self._files)} pictures, got {len(clock.stamps_ns)} times")
+        transfer = "srgb" if transfer == "auto" else transfer
+        self._tables = {bits: LightTables(transfer, bits=bits) for bits in (8, 16)}
         first = _read_picture(self._files[0])
         self._size = (first.shape[1], first.shape[0])
-        light = "linear, 32-bit float" if first.dtype == np.float32 else f"{self._transfer}, BT.709 weights"
+        light = "linear, 32-bit float" if first.dtype == np.float32 else f"{transfer}, BT.709 weights"
         self.description = Description(
             name=path.name or str(path),
             width=self._size[0],
@@ -237,18 +225,10 @@ def _refuse_deep_colour(file: Path, picture: Image.Image) -> None:
 class VideoSource:
     """The frames of a video, at their presentation times; see `open_source` for arguments."""
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        fps: float | None = None,
-        stamps_ns: Sequence[int] | None = None,
-        transfer: str = "auto",
-    ) -> None:
+    def __init__(self, path: Path, clock: _Clock, transfer: str) -> None:
         self._av = need("videos need PyAV", "video", "av")
         self._path = path
-        self._transfer = transfer
-        self._clock = _Clock(fps=fps, stamps_ns=stamps_ns, path=path)
+        self._clock = clock
         with self._open() as container:
             stream = container.streams.video[0]
             first = next(self._decoded(container), None)

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from neurosim_core.io.event_file import EventFileError, EventSource, gather_blocks
+from neurosim_core.io.event_file import EventFileError, EventSource, choose_topic, gather_blocks
 from neurosim_core.packets import PACKET_CLASSES, EventArrays, Events, Packet
 
 
@@ -28,12 +28,12 @@ class LogSource(EventSource):
             for entry in self._log.topics
             if entry.schema.name in known and entry.topic.count("/") == 2
         }
+        self._sensor = sensor
+
+    def begin(self) -> None:
+        """Choose the camera, and with it the vehicle."""
         cameras = [topic for topic, kind in self._types.items() if kind.__name__ == "Events"]
-        chosen = [topic for topic in cameras if topic.endswith(f"/{sensor}") or not sensor]
-        if not chosen:
-            self._log.close()
-            raise EventFileError(f"{path} has no event camera {sensor!r}, known: {cameras}")
-        self._topic = chosen[0]
+        self._topic = choose_topic(self._path, cameras, self._sensor)
         self._vehicle = self._topic.rpartition("/")[0]
         first = next((packet for packet in self.packets() if isinstance(packet, Events)), None)
         self.size = (first.width, first.height) if first else (1, 1)

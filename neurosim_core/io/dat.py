@@ -36,18 +36,17 @@ class DatSource(EventSource):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._file = open(path, "rb")  # noqa: SIM115 (closed by close())
-        try:
-            header = read_header(self._file)
-            kind = self._file.read(2)
-            self._begin = self._file.tell()
-            if len(kind) < 2 or kind[0] not in _KINDS or kind[1] != _RECORD.itemsize or not header:
-                raise EventFileError(f"{path} is not a DAT file of change detection events")
-            known = [header.get(key, "") for key in ("width", "height")]
-            is_told = all(re.fullmatch(r"\d+", value) for value in known)
-            self.size = (int(known[0]), int(known[1])) if is_told else None
-        except BaseException:
-            self._file.close()
-            raise
+
+    def begin(self) -> None:
+        """Read the header."""
+        header = read_header(self._file)
+        kind = self._file.read(2)
+        self._begin = self._file.tell()
+        if len(kind) < 2 or kind[0] not in _KINDS or kind[1] != _RECORD.itemsize or not header:
+            raise EventFileError(f"{self._path} is not a DAT file of change detection events")
+        known = [header.get(key, "") for key in ("width", "height")]
+        is_told = all(re.fullmatch(r"\d+", value) for value in known)
+        self.size = (int(known[0]), int(known[1])) if is_told else None
 
     def close(self) -> None:
         """Close the file."""

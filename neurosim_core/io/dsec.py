@@ -38,17 +38,17 @@ class DsecSource(EventSource):
         super().__init__(path)
         self._events = Hdf5Source(path / EVENTS)
         self.notes = self._events.notes
-        try:
-            file = path / EVENTS.with_name("rectify_map.h5")
-            with open_hdf5(file) as maps, damage_of(file):
-                found = np.asarray(maps["rectify_map"])
-            if found.ndim != 3 or found.shape[2] != 2:
-                raise EventFileError(f"{file}: rectify_map has shape {found.shape}, not [height, width, 2]")
-            self._rectified = np.rint(found).astype(np.int64)
-            self.size = (found.shape[1], found.shape[0])
-        except BaseException:
-            self._events.close()
-            raise
+
+    def begin(self) -> None:
+        """Find the events, and read where their pixels are in the rectified picture."""
+        self._events.begin()
+        file = self._path / EVENTS.with_name("rectify_map.h5")
+        with open_hdf5(file) as maps, damage_of(file):
+            found = np.asarray(maps["rectify_map"])
+        if found.ndim != 3 or found.shape[2] != 2:
+            raise EventFileError(f"{file}: rectify_map has shape {found.shape}, not [height, width, 2]")
+        self._rectified = np.rint(found).astype(np.int64)
+        self.size = (found.shape[1], found.shape[0])
 
     def close(self) -> None:
         """Close the file of events."""

@@ -61,9 +61,16 @@ class EventSource:
     packets: Callable[[], Iterator[Packet]] | None = None
 
     def __init__(self, path: Path) -> None:
-        """Begin to read a file."""
+        """Open a file, and no more: what fails later closes it."""
         self._path = path
         self.notes: list[str] = []
+
+    def begin(self) -> None:
+        """Read what the file says of itself; called once.
+
+        Raises:
+            EventFileError: It is not of the format, or damaged.
+        """
 
     def read(self) -> Iterator[EventArrays]:
         """Yield all events from the first on, as they are in the file, about a million at a time.
@@ -109,8 +116,9 @@ class EventReader:
 
     def __init__(self, path: Path, source: EventSource, size: tuple[int, int] | None = None) -> None:
         self._path, self._source, self.notes, self.packets = path, source, source.notes, source.packets
-        self._first_notes = [*source.notes]
         try:
+            source.begin()
+            self._first_notes = [*source.notes]
             self.width, self.height = size or source.size or _find_size(source.read())
         except BaseException:
             source.close()
@@ -384,11 +392,19 @@ def read_words(file: BinaryIO, begin: int, size: int, notes: list[str]) -> Itera
         begin += len(data)
 
 
+def choose_topic(path: Path, cameras: list[str], sensor: str) -> str:
+    """Return the topic of an event camera by its last name; of an empty name the first."""
+    chosen = [topic for topic in cameras if not sensor or topic.endswith(f"/{sensor.lstrip('/')}")]
+    if not chosen:
+        raise EventFileError(f"{path} has no event camera {sensor!r}, known: {cameras}")
+    return chosen[0]
+
+
 def gather_blocks(parts: Iterable[Any]) -> Iterator[EventArrays]:
     """Yield events, or what has their columns, together until they are a million."""
-    pending: list[Any] = []
+    pending: list[EventArrays] = []
     for part in parts:
-        pending.append(part)
+        pending.append(EventArrays(part.t, part.x, part.y, part.polarity))
         if sum(len(each.t) for each in pending) >= BLOCK_EVENTS:
             yield join_events(pending)
             pending = []

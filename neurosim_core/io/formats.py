@@ -94,7 +94,7 @@ def check_events(path: Path) -> None:
     if path.is_dir() or (path.suffix.lower() in FORMATS["recording"].suffixes and is_recording(path)):
         return
     if (name := _format_in(path)) in (*_UNITLESS, "mvsec"):
-        _open(name, path).close()
+        EventReader(path, _open(name, path), (1, 1)).close()
 
 
 def open_events(

@@ -30,7 +30,7 @@ from neurosim_core.io.event_file import (
     in_microseconds,
 )
 from neurosim_core.packets import EventArrays, Events, Packet, packet_class
-from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
+from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, recording
 from neurosim_core.record.chunks import read_rows
 from neurosim_core.record.hdf5 import FORMAT, import_h5py
 from neurosim_core.record.header import SensorDescription
@@ -38,6 +38,11 @@ from neurosim_core.record.header import SensorDescription
 _NAMES = (("t", "x", "y", "p"), ("ts", "xs", "ys", "ps"))
 _PLACES = ("events", "prophesee/left", "CD/events")
 _SPAN_MAX_US = 30 * 24 * 3_600_000_000
+
+
+def damage_of(path: Path) -> contextlib.AbstractContextManager[None]:
+    """Turn what h5py raises on a damaged file into an EventFileError."""
+    return recording.damage_of(path, EventFileError)
 
 
 def open_hdf5(path: Path) -> Any:
@@ -58,21 +63,21 @@ class Hdf5Source(EventSource):
 
     def __init__(self, path: Path, *, sensor: str = "", unit_us: float | None = None) -> None:
         super().__init__(path)
-        self._unit_us = unit_us
+        self._sensor, self._unit_us = sensor, unit_us
         self._file = open_hdf5(path)
-        try:
-            with damage_of(path):
-                self._open(sensor)
-                is_own = self._file.attrs.get("format") == FORMAT
-                if is_own and unit_us is not None:
-                    raise EventFileError(f"{path}: times of a recording of Neurosim are microseconds")
-                self.knows_unit = is_own or unit_us is not None
-                attributes = self._group.attrs
-                is_told = "width" in attributes and "height" in attributes
-                self.size = (int(attributes["width"]), int(attributes["height"])) if is_told else None
-        except BaseException:
-            self._file.close()
-            raise
+
+    def begin(self) -> None:
+        """Find the events."""
+        with damage_of(self._path):
+            is_own = self._file.attrs.get("format") == FORMAT
+            self._group = self._group_of(self._sensor) if is_own else self._file
+            self._find_events()
+            if is_own and self._unit_us is not None:
+                raise EventFileError(f"{self._path}: times of a recording of Neurosim are microseconds")
+            self.knows_unit = is_own or self._unit_us is not None
+            attributes = self._group.attrs
+            is_told = "width" in attributes and "height" in attributes
+            self.size = (int(attributes["width"]), int(attributes["height"])) if is_told else None
 
     def packets(self) -> Iterator[Packet]:
         """Yield what a recording has besides events, in the order of time; of files of DSEC nothing."""
@@ -87,19 +92,19 @@ class Hdf5Source(EventSource):
         """Close the file."""
         self._file.close()
 
-    def _open(self, sensor: str) -> None:
-        file, self._group = self._file, self._file
-        if file.attrs.get("format") == FORMAT:
-            cameras = [name for name, group in file["sensors"].items() if "events" in group]
-            if sensor not in ("", *cameras) or not cameras:
-                kind = EventFileError if cameras else NoEventsError
-                raise kind(f"{self._path} has no event camera {sensor!r}, known: {cameras}")
-            described = sorted(
-                cameras, key=lambda name: int(file[f"sensors/{name}"].attrs.get("index", 1 << 30))
-            )
-            self._group = file[f"sensors/{sensor or described[0]}"]
-            if not bool(file.attrs["clean"]):
-                self.notes.append(f"{self._path} was not closed properly: events at its end are missing")
+    def _group_of(self, sensor: str) -> Any:
+        """Return the group of an event camera in a recording."""
+        sensors = self._file["sensors"]
+        cameras = [name for name, group in sensors.items() if "events" in group]
+        if sensor not in ("", *cameras) or not cameras:
+            kind = EventFileError if cameras else NoEventsError
+            raise kind(f"{self._path} has no event camera {sensor!r}, known: {cameras}")
+        if not bool(self._file.attrs["clean"]):
+            self.notes.append(f"{self._path} was not closed properly: events at its end are missing")
+        first = min(cameras, key=lambda name: int(sensors[name].attrs.get("index", 1 << 30)))
+        return sensors[sensor or first]
+
+    def _find_events(self) -> None:
         known = (self._group[place] for place in _PLACES if place in self._group)
         fits = ((found, names) for found in known for names in _NAMES if {*names} <= _parts_of(found))
         self._events: Any
@@ -149,13 +154,7 @@ class RecordingSink:
 
     def __init__(self, path: Path, *, width: int, height: int, sensor: str = "events") -> None:
         self._path = path
-        described = SensorDescription(
-            name=sensor,
-            kind="event_camera",
-            rate_hz=1e6 / PACKET_US,
-            position=np.zeros(3),
-            orientation=np.array([0.0, 0.0, 0.0, 1.0]),
-        )
+        described = SensorDescription(name=sensor, kind="event_camera", rate_hz=1e6 / PACKET_US)
         header = RecordingHeader(
             config_yaml="conversion: {}\n", seed=0, version=__version__, sensors=(described,)
         )
@@ -188,15 +187,3 @@ def _parts_of(found: Any) -> set[str]:
 
 def _class(recording: Recording, sensor: str) -> type[Packet]:
     return packet_class(recording.schema(sensor))
-
-
-@contextlib.contextmanager
-def damage_of(path: Path) -> Iterator[None]:
-    """Turn what h5py raises on a damaged file into an EventFileError."""
-    try:
-        yield
-    except EventFileError:
-        raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, IndexError) as error:
-        plugin = "; DSEC compresses with Blosc: pip install hdf5plugin" if "filter" in str(error) else ""
-        raise EventFileError(f"{path} is damaged: {error}{plugin}") from None

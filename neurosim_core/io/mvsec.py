@@ -34,25 +34,23 @@ class MvsecSource(EventSource):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        truth = path.with_name(f"{path.stem.removesuffix('_data')}_gt{path.suffix}")
         self._files = [open_hdf5(path)]
-        try:
-            if path.stem.endswith("_data") and truth.exists():
-                self._files.append(open_hdf5(truth))
-            with damage_of(path):
-                groups = [file[_GROUP] for file in self._files if _GROUP in file]
-                if _GROUP not in self._files[0]:
-                    raise EventFileError(f"{path} has no {_GROUP}: it is not a file of MVSEC")
-                if "events" not in groups[0]:
-                    raise NoEventsError(f"{path} has no events: ground truth is read with NAME_data.hdf5")
-                self._arrays = {name: array for group in groups[::-1] for name, array in group.items()}
-                shapes = [
-                    self._arrays[n].shape for n in map(_ROWS.get, ("image", "depth")) if n in self._arrays
-                ]
-                self.size = (int(shapes[0][2]), int(shapes[0][1])) if shapes else None
-        except BaseException:
-            self.close()
-            raise
+
+    def begin(self) -> None:
+        """Find the arrays, also those of the file of ground truth beside one of data."""
+        path = self._path
+        truth = path.with_name(f"{path.stem.removesuffix('_data')}_gt{path.suffix}")
+        if path.stem.endswith("_data") and truth.exists():
+            self._files.append(open_hdf5(truth))
+        with damage_of(path):
+            groups = [file[_GROUP] for file in self._files if _GROUP in file]
+            if _GROUP not in self._files[0]:
+                raise EventFileError(f"{path} has no {_GROUP}: it is not a file of MVSEC")
+            if "events" not in groups[0]:
+                raise NoEventsError(f"{path} has no events: ground truth is read with NAME_data.hdf5")
+            self._arrays = {name: array for group in groups[::-1] for name, array in group.items()}
+            shapes = [self._arrays[_ROWS[n]].shape for n in ("image", "depth") if _ROWS[n] in self._arrays]
+            self.size = (int(shapes[0][2]), int(shapes[0][1])) if shapes else None
 
     def packets(self) -> Iterator[Packet]:
         """Yield what is there besides events, in the order of time.

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -31,20 +30,12 @@ class NpzSource(EventSource):
     def __init__(self, path: Path, *, unit_us: float | None = None) -> None:
         super().__init__(path)
         self.knows_unit = unit_us is not None
-        with open(path, "rb"):
-            pass  # an OSError from here on comes of what is in it
-        try:
-            with zipfile.ZipFile(path) as archive:
-                found = {}
-                for member in archive.namelist():
-                    if member.removesuffix(".npy") not in _NAMES:
-                        continue
-                    with archive.open(member) as file:
-                        found[member.removesuffix(".npy")] = np.lib.format.read_array(
-                            file, allow_pickle=False
-                        )
-        except Exception as error:  # what NumPy raises for damage is not listed anywhere
-            raise EventFileError(f"{path} is not a whole NPZ file: {error}") from None
+        with open(path, "rb") as file:
+            try:
+                with np.load(file, allow_pickle=False) as archive:
+                    found = {name: archive[name] for name in archive.files if name in _NAMES}
+            except Exception as error:  # what NumPy raises for damage is not listed anywhere
+                raise EventFileError(f"{path} is not a whole NPZ file: {error}") from None
         columns = []
         for name, others in _OTHER_NAMES.items():
             key = next((n for n in (name, *others) if n in found), None)
@@ -72,7 +63,7 @@ class NpzSink:
     """Writes an NPZ file when it is closed."""
 
     def __init__(self, path: Path, *, width: int, height: int) -> None:
-        self._path, self._size = path, {"width": np.array(width), "height": np.array(height)}
+        self._path, self._size = path, (width, height)
         self._blocks: list[EventArrays] = []
         path.touch()  # says now that it cannot be written
 
@@ -82,11 +73,6 @@ class NpzSink:
 
     def close(self) -> None:
         """Complete the file."""
-        t, x, y, p = join_events(self._blocks)
-        arrays = {**self._size, "t": t, "x": x, "y": y, "p": p}
-        with zipfile.ZipFile(self._path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-            for name, array in arrays.items():
-                member = zipfile.ZipInfo(f"{name}.npy")  # of 1980: the same events give the same bytes
-                member.compress_type = zipfile.ZIP_DEFLATED
-                with archive.open(member, "w", force_zip64=True) as file:
-                    np.lib.format.write_array(file, array)
+        (width, height), (t, x, y, p) = self._size, join_events(self._blocks)
+        with open(self._path, "wb") as file:  # a path would get the suffix .npz
+            np.savez_compressed(file, width=width, height=height, t=t, x=x, y=y, p=p)

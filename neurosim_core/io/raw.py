@@ -47,15 +47,14 @@ class RawSource(EventSource):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._file = open(path, "rb")  # noqa: SIM115 (closed by close())
-        try:
-            header = read_header(self._file)
-            self._begin = self._file.tell()
-            self._encoding = _encoding(header, path)
-            self._t0_us = int(header["t0"]) if re.fullmatch(r"\d+", header.get("t0", "")) else 0
-            self.size = _size(header)
-        except BaseException:
-            self._file.close()
-            raise
+
+    def begin(self) -> None:
+        """Read the header."""
+        header = read_header(self._file)
+        self._begin = self._file.tell()
+        self._encoding = _encoding(header, self._path)
+        self._t0_us = int(header["t0"]) if re.fullmatch(r"\d+", header.get("t0", "")) else 0
+        self.size = _size(header)
 
     def close(self) -> None:
         """Close the file."""

@@ -9,12 +9,18 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from neurosim_core.install import need
-from neurosim_core.io.event_file import EventFileError, EventSource, PacketCutter, gather_blocks
+from neurosim_core.io.event_file import (
+    EventFileError,
+    EventSource,
+    PacketCutter,
+    choose_topic,
+    gather_blocks,
+)
 from neurosim_core.packets import EventArrays, Odometry, Packet
 
 _VEHICLE = "drone"
@@ -36,18 +42,11 @@ class BagSource(EventSource):
     def __init__(self, path: Path, *, sensor: str = "") -> None:
         super().__init__(path)
         bags = _bridge()
-        self._error = bags.BagError
+        self._sensor, self._event_types, self._error = sensor, bags.EVENT_TYPES, bags.BagError
         try:
             self._bag = bags.BagReader(path)
         except bags.BagError as error:
             raise EventFileError(str(error)) from None
-        try:
-            self._choose(sensor, bags.EVENT_TYPES)
-            found = ((int(m.width), int(m.height)) for _, m in self._messages(self._topic))
-            self.size = next(found, (1, 1))
-        except BaseException:
-            self._bag.close()
-            raise
 
     def read(self) -> Iterator[EventArrays]:
         """See `EventSource.read`."""
@@ -71,19 +70,19 @@ class BagSource(EventSource):
         """Close the bag."""
         self._bag.close()
 
-    def _choose(self, sensor: str, event_types: Collection[str]) -> None:
+    def begin(self) -> None:
+        """Choose the camera, and the topics of its vehicle."""
         topics = self._bag.topics
-        cameras = [topic for topic, kind in topics.items() if kind in event_types]
-        chosen = [topic for topic in cameras if topic.endswith(f"/{sensor.lstrip('/')}") or not sensor]
-        if not chosen:
-            raise EventFileError(f"{self._path} has no event camera {sensor!r}, known: {cameras}")
-        self._topic = chosen[0]
+        cameras = [topic for topic, kind in topics.items() if kind in self._event_types]
+        self._topic = choose_topic(self._path, cameras, self._sensor)
         vehicle = f"{self._topic.rpartition('/')[0]}/"
         self._others = {
             topic: topic.removeprefix(vehicle).removesuffix("/image_raw").strip("/").replace("/", "_")
             for topic in topics
             if topic not in cameras
         }
+        found = ((int(m.width), int(m.height)) for _, m in self._messages(self._topic))
+        self.size = next(found, (1, 1))
 
     def _messages(self, *topics: str) -> Iterator[tuple[str, Any]]:
         try:

@@ -1,11 +1,40 @@
-"""Files that are written: the one below HDF5, which keeps the state of the last seal, and what errors say."""
+"""Files that are written: the one below HDF5, what errors say of a file, and whose it is after a fork."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Protocol
+
+
+class _Recording(Protocol):
+    def disown(self) -> None:
+        """Write nothing any more; called once, in a process that was forked."""
+
+
+_open: weakref.WeakSet[_Recording] = weakref.WeakSet()
+
+
+def disown_when_forked(recording: _Recording) -> None:
+    """Have `recording.disown()` called in each process that is forked from this one: its parent goes on."""
+    _open.add(recording)
+
+
+def forked_error(path: Path) -> RuntimeError:
+    """Return what a forked process is told that writes to a recording of its parent."""
+    return RuntimeError(f"{path} was opened before this process was forked: only its parent can write to it")
+
+
+def _disown() -> None:
+    for recording in [*_open]:
+        recording.disown()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_disown)
 
 
 @contextlib.contextmanager

@@ -54,8 +54,7 @@ from neurosim_core.clock import NS_PER_S
 from neurosim_core.install import need
 from neurosim_core.packets import Packet
 from neurosim_core.record.columns import deflate
-from neurosim_core.record.disk import Disk
-from neurosim_core.record.forked import disown_when_forked, forked_error
+from neurosim_core.record.disk import Disk, disown_when_forked, forked_error
 from neurosim_core.record.header import RecordingHeader
 from neurosim_core.record.streams import Stream
 

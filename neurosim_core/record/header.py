@@ -49,9 +49,9 @@ class SensorDescription:
     """Kind of the sensor, such as event_camera, rgb or imu."""
     rate_hz: float
     """Packets a second [Hz]."""
-    position: NDArray[np.float64]
+    position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     """p_BS [m], shape [3]: its origin in the body frame."""
-    orientation: NDArray[np.float64]
+    orientation: NDArray[np.float64] = field(default_factory=lambda: np.array([0.0, 0.0, 0.0, 1.0]))
     """q_BS, xyzw, shape [4]: takes S to body coordinates; S of a camera is its optical frame."""
     intrinsics: Intrinsics | None = None
     """The lens, for cameras."""
@@ -89,25 +89,17 @@ def describe_sensors(sensors: Mapping[str, SensorConfig]) -> tuple[SensorDescrip
 
 def _describe(name: str, sensor: Any) -> SensorDescription:
     mount, lens = getattr(sensor, "mount", None), getattr(sensor, "lens", None)
-    position, orientation = np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
+    more: dict[str, Any] = {}
     if mount is not None:
-        position = np.array(mount.position_m)
-        orientation = mount.quaternion() if lens is None else mount.optical_quaternion()
-    intrinsics = None
+        more["position"] = np.array(mount.position_m)
+        more["orientation"] = mount.quaternion() if lens is None else mount.optical_quaternion()
     if lens is not None:
-        intrinsics = Intrinsics(
+        more["intrinsics"] = Intrinsics(
             width=lens.width,
             height=lens.height,
             **lens.intrinsics()._asdict(),
             distortion_model=lens.distortion_model,
             distortion=lens.distortion_coefficients,
         )
-    return SensorDescription(
-        name=name,
-        kind=sensor.kind,
-        rate_hz=sensor.packets.rate_hz,
-        position=position,
-        orientation=orientation,
-        intrinsics=intrinsics,
-        settings=sensor.model_dump_json(),
-    )
+    rate_hz, settings = sensor.packets.rate_hz, sensor.model_dump_json()
+    return SensorDescription(name=name, kind=sensor.kind, rate_hz=rate_hz, settings=settings, **more)

@@ -1,14 +1,16 @@
-"""A recording that a process of its own compresses and writes.
+"""A recording that a process of its own writes, and more processes, forked from that one, compress.
 
-Both would take Python's interpreter lock from the thread that flies. Packets go through a socket: as a
+All this would take Python's interpreter lock from the thread that flies. Packets go through a socket: as a
 pickled list, and after it their arrays as they are. Where the stream ends, also because the process that flew
-was killed, the file is closed.
+was killed, the file is closed. Threads could compress, but for the lock: a chunk takes it dozens of times,
+and each time waits for all others. A thread that hands a chunk to a process asks for it thrice.
 """
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import itertools
 import os
 import pickle
 import queue
@@ -26,9 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurosim_core.packets import Packet, PacketSchema, as_numpy, packet_class, schema_of
-from neurosim_core.record.compressors import Compressors
-from neurosim_core.record.disk import naming_file
-from neurosim_core.record.forked import disown_when_forked, forked_error
+from neurosim_core.record.columns import deflate
+from neurosim_core.record.disk import disown_when_forked, forked_error, naming_file
 from neurosim_core.record.frames import connect, receive_frame, send_frame
 from neurosim_core.record.hdf5 import RecordingWriter, deflate_count, import_h5py
 from neurosim_core.record.header import RecordingHeader
@@ -237,12 +238,65 @@ class RecordingProcess:
             raise self._failure
 
 
+class _Compressors:
+    """Processes that are forked from this one, which must not have threads yet; they end with it."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._idle: queue.SimpleQueue[socket.socket] = queue.SimpleQueue()
+        for _ in range(count):
+            ours, theirs = connect()
+            if os.fork() == 0:
+                os.closerange(0, 3)  # the end of this process must be seen by those who have them
+                ours.close()
+                _compress(theirs)
+            theirs.close()
+            self._idle.put(ours)
+
+    def deflate(self, columns: Sequence[tuple[Sequence[NDArray[Any]], int]]) -> list[list[Any]]:
+        """Return what `columns.deflate` does; from as many threads at a time as there are processes.
+
+        Raises:
+            OSError: A process has ended.
+        """
+        link = self._idle.get()
+        try:
+            forms = [(parts[0].dtype.str, parts[0].shape[1:], length) for parts, length in columns]
+            counts = [sum(map(len, parts)) for parts, _ in columns]
+            arrays = [np.ascontiguousarray(part) for parts, _ in columns for part in parts]
+            send_frame(link, [pickle.dumps((forms, counts))], arrays)
+            (sizes,), data = receive_frame(link)
+        except (EOFError, OSError):
+            raise OSError("a process that compresses has ended") from None
+        finally:
+            self._idle.put(link)
+        ends = itertools.accumulate(itertools.chain(*sizes))
+        return [[data[end - size : end] for size, end in zip(column, ends, strict=False)] for column in sizes]
+
+
+def _compress(link: socket.socket) -> None:
+    """Compress what comes, and end the process when nobody asks any more."""
+    try:
+        while True:
+            ((forms, counts),), data = receive_frame(link)
+            columns, begin = [], 0
+            for (dtype, shape, length), count in zip(forms, counts, strict=True):
+                rows: NDArray[Any] = np.ndarray((count, *shape), dtype, data, begin)
+                columns.append(([rows], length))
+                begin += rows.nbytes
+            chunks = deflate(columns)
+            body = pickle.dumps([[*map(len, column)] for column in chunks])
+            send_frame(link, [body], [np.frombuffer(b"".join(itertools.chain(*chunks)), np.uint8)])
+    finally:
+        os._exit(0)
+
+
 def main() -> None:
     """Be the process: write what comes from file 0, the socket, and report on file 1."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # it ends with the one that flies
         signal.signal(number, signal.SIG_IGN)
     gc.disable()  # packets have no cycles
-    compressors = Compressors(deflate_count())
+    compressors = _Compressors(deflate_count())
     failure, kept_ns = None, None
     with socket.socket(fileno=0) as source:
         try:

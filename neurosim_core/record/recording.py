@@ -50,7 +50,7 @@ class Recording:
         except OSError as error:
             raise ValueError(f"{self._path} is not a readable HDF5 file: {error}") from error
         try:
-            with _damage_of(self._path):
+            with damage_of(self._path):
                 self.header = _read_header(self._file, self._path)
                 self.clean = bool(self._file.attrs["clean"])
                 self._streams = {
@@ -126,7 +126,7 @@ class Recording:
         streams = [self._stream(name).packets(start_s, end_s) for name in (sensors or self.sensors)]
         merged = heapq.merge(*streams, key=lambda item: item[:2])
         while True:
-            with _damage_of(self._path):
+            with damage_of(self._path):
                 _, _, packet = next(merged, (None, None, None))
             if packet is None:
                 return
@@ -243,12 +243,15 @@ class _Stream:
 
 
 @contextlib.contextmanager
-def _damage_of(path: Path) -> Iterator[None]:
-    """Say of the errors of HDF5 that they are damage of a file."""
+def damage_of(path: Path, kind: type[ValueError] = ValueError) -> Iterator[None]:
+    """Say of the errors of HDF5 that they are damage of a file, by an error of a kind."""
     try:
         yield
-    except (IndexError, KeyError, OSError, RuntimeError, TypeError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+    except kind:
+        raise
+    except (IndexError, KeyError, OSError, OverflowError, RuntimeError, TypeError, ValueError) as error:
+        plugin = "; DSEC compresses with Blosc: pip install hdf5plugin" if "filter" in str(error) else ""
+        raise kind(f"{path} is damaged: {error}{plugin}") from error
 
 
 def _read_header(file: Any, path: Path) -> RecordingHeader:
@@ -281,15 +284,10 @@ def _read_header(file: Any, path: Path) -> RecordingHeader:
 def _read_sensor(group: Any) -> SensorDescription:
     intrinsics = None
     if "intrinsics" in group.attrs:
-        fx, fy, cx, cy = (float(v) for v in group.attrs["intrinsics"])
-        width, height = (int(v) for v in group.attrs["resolution"])
+        names = ("width", "height", "fx", "fy", "cx", "cy")
+        lens = *group.attrs["resolution"].tolist(), *group.attrs["intrinsics"].tolist()
         intrinsics = Intrinsics(
-            width=width,
-            height=height,
-            fx=fx,
-            fy=fy,
-            cx=cx,
-            cy=cy,
+            **dict(zip(names, lens, strict=True)),
             distortion_model=str(group.attrs.get("distortion_model", "")),
             distortion=tuple(float(v) for v in group.attrs.get("distortion", ())),
         )

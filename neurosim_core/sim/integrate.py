@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Any
 
+import warp as wp
 from numpy.typing import ArrayLike
 
 from neurosim_core.control import CommandMode, Controller
@@ -16,7 +17,7 @@ from neurosim_core.packets import Collision, Odometry, Packet
 from neurosim_core.runtime.cuda import use_stream
 from neurosim_core.runtime.timing import timed
 from neurosim_core.sensors.state_sampler import sample_packet
-from neurosim_core.sim.inputs import CommandBuffer
+from neurosim_core.sim.inputs import CommandBuffer, as_device_array, check_rows
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.schedule import Boundary
 from neurosim_core.sim.state import Batch, State
@@ -30,7 +31,44 @@ COLLISION = "collision"
 """Name under which collisions are reported."""
 
 
-def command_buffer(model: Model, state: State, mode: CommandMode) -> CommandBuffer:
+def forget_controllers(state: State) -> None:
+    """Have controllers of outside commands made anew, with other gains; the path controller stays."""
+    state.controllers.clear()
+    state.commands.clear()
+
+
+Command = Setpoint | ArrayLike | None
+"""What an outside controller commands: a setpoint, a row of its mode, or None: what holds now."""
+
+
+def set_command(model: Model, state: State, command: Command, mode: CommandMode) -> None:
+    """Have the next batch begin with a setpoint, which becomes rotor speeds at the state of the vehicle then.
+
+    Rows of one world come from the host, and the batch before has been read: what it took from there is free.
+    Those of many worlds, shape [N, width], may be on the device.
+
+    Raises:
+        ValueError: The path prescribes the motion, the mode is unknown, or rows are of a wrong shape or, on
+            the host, not finite.
+    """
+    if command is None:
+        return
+    if model.path.attitude is not None:
+        raise ValueError("path.kind poses is followed whatever is commanded: give no command")
+    if isinstance(command, Setpoint):
+        command, mode = command.row(), command.mode
+    buffer = _command_buffer(model, state, mode)
+    on_device = None if state.on_host else as_device_array(command, buffer.array.device)
+    if on_device is not None:
+        check_rows(on_device, buffer.array, "commands")
+        wp.utils.array_cast(on_device, buffer.array)
+    else:
+        put = buffer.stage if state.on_host else buffer.write
+        put(_checked_command(model, state, command, mode))
+    state.command_mode = mode
+
+
+def _command_buffer(model: Model, state: State, mode: CommandMode) -> CommandBuffer:
     """Return where the setpoints of a mode go; the first time, its controller is made.
 
     Raises:
@@ -52,52 +90,12 @@ def command_buffer(model: Model, state: State, mode: CommandMode) -> CommandBuff
     return state.commands[mode]
 
 
-def forget_controllers(state: State) -> None:
-    """Have controllers of outside commands made anew, with other gains; the path controller stays."""
-    state.controllers.clear()
-    state.commands.clear()
-
-
-def checked_command(model: Model, state: State, command: ArrayLike, mode: CommandMode) -> Any:
-    """Return setpoints of the host as rows of the mode, shape [N, width].
-
-    Raises:
-        ValueError: They are of a wrong shape or not finite.
-    """
-    command_buffer(model, state, mode)
+def _checked_command(model: Model, state: State, command: ArrayLike, mode: CommandMode) -> Any:
+    """Return setpoints of the host as rows of the mode, shape [N, width]."""
     if mode == "motor_speeds":
         width = model.airframe.rotor_count
         return as_rows(command, name="rotor_speed_command", count=state.world_count, width=width)
     return state.controllers[mode].checked(command)
-
-
-Command = Setpoint | ArrayLike | None
-"""What an outside controller commands: a setpoint, a row of its mode, or None: what holds now."""
-
-
-def set_command(model: Model, state: State, command: Command, mode: CommandMode) -> None:
-    """Have the next batch begin with a setpoint, which becomes rotor speeds at the state of the vehicle then.
-
-    The batch before has been read: what it took from the host is free.
-    """
-    if command is None:
-        return
-    refuse_commands(model)
-    if isinstance(command, Setpoint):
-        command, mode = command.row(), command.mode
-    rows = checked_command(model, state, command, mode)
-    state.commands[mode].stage(rows)
-    state.command_mode = mode
-
-
-def refuse_commands(model: Model) -> None:
-    """Raise if what carries the sensors follows a motion that is prescribed.
-
-    Raises:
-        ValueError: It does.
-    """
-    if model.path.attitude is not None:
-        raise ValueError("path.kind poses is followed whatever is commanded: give no command")
 
 
 def plan_batch(

@@ -20,20 +20,17 @@ from numpy.typing import ArrayLike
 from neurosim_core.clock import Rate
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import CommandMode
-from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.render.camera import Lens
 from neurosim_core.scene.bodies import throw_bodies
 from neurosim_core.sim.inputs import (
     Start,
-    as_device_array,
-    check_rows,
     checked_mask,
     checked_rows,
     checked_seeds,
     make_seeds,
     take_seeds,
 )
-from neurosim_core.sim.integrate import checked_command, command_buffer, plan_batch, refuse_commands
+from neurosim_core.sim.integrate import plan_batch, set_command
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.observation import Observation, make_observation
 from neurosim_core.sim.parameters import WorldSettings, check_lenses, lenses_differ, vary_sensors
@@ -337,10 +334,7 @@ class Simulation:
                 looked at: a vehicle whose command is not finite is held (`Observation.status`).
         """
         self._require_reset()
-        if isinstance(commands, Setpoint):
-            commands, mode = commands.row(), commands.mode
-        if commands is not None:
-            self._take_commands(commands, mode)
+        set_command(self._model, self._state, commands, mode)
         return self._advance(closed_loop=False)
 
     def rollout(self, periods: int) -> Observation:
@@ -408,18 +402,6 @@ class Simulation:
                 self._observations.clear()
             self._observations[period] = make_observation(self._state, period)
         return self._observations[period]
-
-    def _take_commands(self, commands: Any, mode: CommandMode) -> None:
-        """Copy commands into the fixed buffer that the graph reads."""
-        refuse_commands(self._model)
-        buffer = command_buffer(self._model, self._state, mode)
-        on_device = as_device_array(commands, self.device)
-        if on_device is not None:
-            check_rows(on_device, buffer.array, "commands")
-            wp.utils.array_cast(on_device, buffer.array)
-        else:
-            buffer.write(checked_command(self._model, self._state, commands, mode))
-        self._state.command_mode = mode
 
     def _check_partial(self) -> None:
         if self._now_ns is None:

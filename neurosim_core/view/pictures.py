@@ -36,15 +36,10 @@ OFF_SRGB = (24, 60, 190)
 _STRENGTHS = tuple(1.0 - 0.4**n for n in range(1, 5))
 
 
-def _palette() -> NDArray[np.uint8]:
-    white = np.array(BACKGROUND_SRGB, dtype=np.float64)
-    rows = [white]
-    for color in (OFF_SRGB, ON_SRGB):
-        rows += [white + strength * (np.array(color) - white) for strength in _STRENGTHS]
-    return np.round(np.stack(rows)).astype(np.uint8)
+_WHITE = np.array(BACKGROUND_SRGB, dtype=np.float64)
+_SHADES = [_WHITE + part * (np.array(color) - _WHITE) for color in (OFF_SRGB, ON_SRGB) for part in _STRENGTHS]
 
-
-PALETTE = _palette()
+PALETTE = np.round([_WHITE, *_SHADES]).astype(np.uint8)
 """sRGB colour of each class, shape [9, 3]: 0 no event, 1-4 last event darker, 5-8 brighter, by count."""
 
 

@@ -161,7 +161,8 @@ def make_blueprint(
             pictures += [rrb.Vertical(*views, name=name)] if many else views
         views = [_view(panel, rolling=rolling) for panel in others]
         if views:
-            plots.append(rrb.Grid(*views, grid_columns=_columns(len(views)), name=name))
+            columns = 2 if len(views) == 4 else 3 if len(views) <= 6 else 4  # leaves few places empty
+            plots.append(rrb.Grid(*views, grid_columns=columns, name=name))
     if pictures:
         shares = [3 * max(map(len, cameras.values()))] if many else [3] * len(pictures)
     right = [rrb.Tabs(*pictures)] if many and pictures else pictures
@@ -185,11 +186,6 @@ def make_blueprint(
         rrb.BlueprintPanel(state="collapsed"),
         auto_views=False,
     )
-
-
-def _columns(count: int) -> int:
-    """Columns of a grid of plots that leaves few places empty."""
-    return 2 if count == 4 else 3 if count <= 6 else 4
 
 
 def _view(panel: Panel, *, rolling: bool) -> Any:
