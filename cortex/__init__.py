@@ -8,26 +8,24 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-# Not on demand: once the module `cortex.message` is loaded, it would stand where the decorator belongs.
-from cortex.message import message as message
-
 if TYPE_CHECKING:
     from cortex.codec import MalformedMessage as MalformedMessage
     from cortex.context import Closed as Closed
     from cortex.link import Info as Info
     from cortex.loan import Loan as Loan
-    from cortex.message import Array as Array
-    from cortex.message import Float32 as Float32
-    from cortex.message import Float64 as Float64
-    from cortex.message import Int8 as Int8
-    from cortex.message import Int16 as Int16
-    from cortex.message import Int32 as Int32
-    from cortex.message import Int64 as Int64
-    from cortex.message import UInt8 as UInt8
-    from cortex.message import UInt16 as UInt16
-    from cortex.message import UInt32 as UInt32
-    from cortex.message import UInt64 as UInt64
-    from cortex.message import Unit as Unit
+    from cortex.message_types import Array as Array
+    from cortex.message_types import Float32 as Float32
+    from cortex.message_types import Float64 as Float64
+    from cortex.message_types import Int8 as Int8
+    from cortex.message_types import Int16 as Int16
+    from cortex.message_types import Int32 as Int32
+    from cortex.message_types import Int64 as Int64
+    from cortex.message_types import UInt8 as UInt8
+    from cortex.message_types import UInt16 as UInt16
+    from cortex.message_types import UInt32 as UInt32
+    from cortex.message_types import UInt64 as UInt64
+    from cortex.message_types import Unit as Unit
+    from cortex.message_types import message as message
     from cortex.node import Node as Node
     from cortex.overview import Liveliness as Liveliness
     from cortex.policy import Policy as Policy
@@ -49,7 +47,8 @@ _HOME = {
         "context": "Closed",
         "link": "Info",
         "loan": "Loan",
-        "message": "Array Float32 Float64 Int8 Int16 Int32 Int64 UInt8 UInt16 UInt32 UInt64 Unit",
+        "message_types": "Array Float32 Float64 Int8 Int16 Int32 Int64 UInt8 UInt16 UInt32 UInt64 Unit "
+        "message",
         "node": "Node",
         "overview": "Liveliness",
         "policy": "Policy keep_last latest reliable",
@@ -61,7 +60,7 @@ _HOME = {
     }.items()
     for name in names.split()
 }
-__all__ = sorted(["message", *_HOME])
+__all__ = sorted(_HOME)
 
 
 def __getattr__(name: str) -> object:

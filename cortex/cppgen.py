@@ -14,7 +14,7 @@ from pathlib import Path
 
 import cortex.messages
 from cortex import layout, records
-from cortex.message import is_message
+from cortex.message_types import is_message
 from cortex.schema import (
     ANY_DTYPE,
     ArrayType,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from cortex.codec import MalformedMessage
-from cortex.message import Array, Int64, UInt32, UInt64, message
+from cortex.message_types import Array, Int64, UInt32, UInt64, message
 from cortex.topic import check_pattern, check_topic
 
 

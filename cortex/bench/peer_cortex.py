@@ -12,7 +12,7 @@ from typing import Any
 import cortex.node
 from cortex.bench.peers import PATIENCE_S, Job, Peer, Send
 from cortex.bench.tally import Finished, Floats, Handler
-from cortex.message import Array, message
+from cortex.message_types import Array, message
 from cortex.node import Node
 from cortex.policy import reliable
 

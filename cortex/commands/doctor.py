@@ -21,7 +21,7 @@ from cortex.commands.session import open_node
 from cortex.commands.text import seconds
 from cortex.compiled import native
 from cortex.host import REGISTRY_LOCK, FileLock, domain_id, runtime_dir
-from cortex.message import message
+from cortex.message_types import message
 from cortex.places import NETWORK_VARIABLES
 from cortex.security import PUBLIC_FILE, default_directory, load_keys
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from cortex.commands.session import CommandError, UsageError, hint, look_around
 from cortex.cppgen import generate, write_headers
 from cortex.evolution import differences, is_evolved
-from cortex.message import is_message
+from cortex.message_types import is_message
 from cortex.schema import EnumType, Schema, nested, schema_of
 from cortex.security import AUTHORIZED_FILE, default_directory, new_keys
 

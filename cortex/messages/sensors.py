@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from cortex.message import Array, UInt32, UInt64, Unit, message
+from cortex.message_types import Array, UInt32, UInt64, Unit, message
 
 
 @message(name="cortex/Events")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated
 
-from cortex.message import Float64, Int64, UInt64, Unit, message
+from cortex.message_types import Float64, Int64, UInt64, Unit, message
 
 
 @message(name="cortex/Clock")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import field
 from typing import Annotated
 
-from cortex.message import Array, Int64, UInt32, UInt64, Unit, message
+from cortex.message_types import Array, Int64, UInt32, UInt64, Unit, message
 
 
 @message(name="cortex/CommandRanges")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 from cortex import Array, Unit, message
-from cortex.message import UInt32, UInt64
+from cortex.message_types import UInt32, UInt64
 
 
 @message(name="neurosim/RenderRequest")

@@ -5,7 +5,19 @@ from __future__ import annotations
 from enum import Enum
 from typing import Annotated
 
-from cortex.message import Array, Float32, Int8, Int16, Int32, UInt8, UInt16, UInt32, UInt64, Unit, message
+from cortex.message_types import (
+    Array,
+    Float32,
+    Int8,
+    Int16,
+    Int32,
+    UInt8,
+    UInt16,
+    UInt32,
+    UInt64,
+    Unit,
+    message,
+)
 
 
 class Mode(Enum):

@@ -22,7 +22,7 @@ import numpy as np
 import cortex
 import cortex.node
 from cortex import Array, Node, Policy, UInt32
-from cortex.message import message
+from cortex.message_types import message
 
 
 @message

@@ -18,7 +18,7 @@ from random_schemas import any_message
 
 from cortex.codec import MalformedMessage, Plan, codec_of
 from cortex.compiled import native
-from cortex.message import Array, Float32, Int8, Int32, UInt64, message
+from cortex.message_types import Array, Float32, Int8, Int32, UInt64, message
 from cortex.messages import Clock, Image, Imu, MotorCommand
 
 

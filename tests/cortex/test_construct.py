@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cortex.compiled import native
-from cortex.message import message
+from cortex.message_types import message
 
 needs_native = pytest.mark.skipif(native is None, reason="cortex._native was not compiled")
 

@@ -11,7 +11,7 @@ import pytest
 
 from cortex.cppgen import generate
 from cortex.layout import block_size, has_tail
-from cortex.message import Array, Int16, UInt8, message
+from cortex.message_types import Array, Int16, UInt8, message
 from cortex.schema import EnumType, Field, Schema, schema_of
 
 INCLUDE = Path(__file__).parents[2] / "cortex" / "cpp" / "include"

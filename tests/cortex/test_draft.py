@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cortex.codec import codec_of
-from cortex.message import Array, Int8, message
+from cortex.message_types import Array, Int8, message
 from cortex.messages import Events, Image
 
 

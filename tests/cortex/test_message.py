@@ -15,7 +15,7 @@ from hypothesis import given
 from numpy.typing import NDArray
 from random_schemas import any_message
 
-from cortex.message import Array, Float32, Int16, UInt8, Unit, is_message, message
+from cortex.message_types import Array, Float32, Int16, UInt8, Unit, is_message, message
 from cortex.schema import ArrayType, EnumType, Field, ListType, OptionalType, SchemaError, schema_of
 
 

@@ -26,7 +26,7 @@ from wire_vectors import load_vectors
 from cortex import reliable
 from cortex.codec import Plan, codec_of
 from cortex.compiled import native
-from cortex.message import Array, message
+from cortex.message_types import Array, message
 from cortex.messages import Image
 from cortex.native import make_coder
 from cortex.schema import Schema, schema_of, type_from_schema

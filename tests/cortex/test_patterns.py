@@ -12,7 +12,7 @@ from processes import SOON_S, wait_for
 
 from cortex import Array, TypeMismatch, reliable
 from cortex.evolution import differences, is_evolved
-from cortex.message import message
+from cortex.message_types import message
 from cortex.schema import schema_of
 from cortex.topic import check_pattern, matches
 

@@ -18,7 +18,7 @@ from random_schemas import schemas
 
 from cortex import schema as schema_module
 from cortex.codec import codec_of
-from cortex.message import Array, Unit, message
+from cortex.message_types import Array, Unit, message
 from cortex.schema import (
     ArrayType,
     EnumType,

@@ -14,7 +14,7 @@ from processes import SOON_S, Beside, in_time, wait_for
 from cortex import Closed, ServiceFailed, ServiceTimeout, ServiceUnavailable
 from cortex.codec import codec_of
 from cortex.context import new_socket
-from cortex.message import message
+from cortex.message_types import message
 from cortex.places import Reach
 from cortex.records import Endpoint
 from cortex.schema import TypeMismatch

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cortex.codec import codec_of
-from cortex.message import Array, message
+from cortex.message_types import Array, message
 from cortex.messages import MotorCommand
 from cortex.tensors import to_numpy, to_torch
 

@@ -12,7 +12,7 @@ from cortex import messages, records
 from cortex.codec import MalformedMessage, Plan, codec_of
 from cortex.intake import Intake
 from cortex.link import Link
-from cortex.message import is_message
+from cortex.message_types import is_message
 from cortex.policy import keep_last
 from cortex.receive_lock import ReceiveLock
 from cortex.records import PublisherRecord

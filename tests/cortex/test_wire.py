@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from cortex.codec import MalformedMessage
 from cortex.control import control_types
-from cortex.message import message
+from cortex.message_types import message
 from cortex.records import Heartbeat, Leave
 from cortex.wire import (
     ATTACH,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from cortex.message import Array, Unit, message
+from cortex.message_types import Array, Unit, message
 
 
 @message(name="example/Scan")
