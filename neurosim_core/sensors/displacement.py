@@ -130,7 +130,8 @@ class DisplacementRule:
         rule.q_WC, rule.q_next_WC = zeros(rows, wp.quatd), zeros(rows, wp.quatd)
         rule.points = zeros((rows, self._probe_count), wp.vec4d)
         rule.seen = zeros((rows, self._probe_count), wp.vec3d)
-        rule.owner = wp.full(rule.points.shape, -1, dtype=int, device=device)  # row 0 is compared before it is cast
+        # On CUDA row 0 is compared before it is cast
+        rule.owner = wp.full(rule.points.shape, -1, dtype=int, device=device)
         self._rule = rule
         self._add_bodies(arrays, rows, motions)
         self._moved = rule.moved = zeros((rows, rows), float)
