@@ -51,8 +51,7 @@ def _run_command(argv: Sequence[str] | None) -> int:
     began_s = time.perf_counter()
     argv = sys.argv[1:] if argv is None else argv
     arguments = _parser(argv).parse_args(argv)
-    # Matrices are small, and threads cost time; only the PyTorch of learning may multiply with OpenBLAS.
-    if arguments.command.__module__ != "neurosim_core.learn.command":
+    if not arguments.many_blas_threads:  # matrices are small, and threads cost time; learning has large ones
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments.began_s = began_s
     if arguments.computes:
@@ -108,7 +107,7 @@ def _parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
         prog="neurosim",
         description="Event cameras, RGB, depth and IMU on agile multirotors.",
     )
-    parser.set_defaults(computes=True)
+    parser.set_defaults(computes=True, many_blas_threads=False)
     parser.add_argument("--debug", action="store_true", help="show where in the code an error arose")
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")

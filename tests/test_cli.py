@@ -376,6 +376,17 @@ def test_what_goes_wrong_is_said_in_one_line(arguments, said, tmp_path, monkeypa
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("command", "threads"), [(["learn", "eval", "absent"], None), (["view", "absent.h5"], "1")]
+)
+def test_only_learning_has_many_threads_of_blas(command, threads, monkeypatch, capsys):
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "restored afterwards")
+    del os.environ["OPENBLAS_NUM_THREADS"]
+    assert cli.main(command) == 1
+    assert os.environ.get("OPENBLAS_NUM_THREADS") == threads
+    capsys.readouterr()
+
+
 def test_debug_shows_where_an_error_arose(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValueError, match=r"nothing\.yaml") as error:

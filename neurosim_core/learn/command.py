@@ -85,7 +85,7 @@ def _add_learn(commands: _Commands) -> None:
     add("--size", "dense", "of flights (default: 48)", dense, type=int, default=48, metavar="PX")
     backbone = "begin with the weights of another network, such as pretrain.pt"
     add("--backbone", "dense", backbone, dense, metavar="FILE")
-    learn.set_defaults(command=partial(_learn, learn, uses))
+    learn.set_defaults(command=partial(_learn, learn, uses), many_blas_threads=True)
 
 
 def _add_deploy(commands: _Commands) -> None:
@@ -114,7 +114,7 @@ def _add_deploy(commands: _Commands) -> None:
         help="--ros: what a thrust of 1 is [N] (default: all of the vehicle it was trained with)",
     )
     deploy.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
-    deploy.set_defaults(command=_deploy)
+    deploy.set_defaults(command=_deploy, many_blas_threads=True)
 
 
 def _add_predict(commands: _Commands) -> None:
@@ -126,7 +126,7 @@ def _add_predict(commands: _Commands) -> None:
     predict.add_argument("--events", default="events", metavar="NAME", help="its camera (default: events)")
     predict.add_argument("--device", default="cpu", help="of the network: cpu, cuda:0, ... (default: cpu)")
     predict.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
-    predict.set_defaults(command=_predict)
+    predict.set_defaults(command=_predict, many_blas_threads=True)
 
 
 def _predict(arguments: argparse.Namespace) -> int:
