@@ -39,9 +39,8 @@ class ControlPage:
         """
         self._node = node
         self._viewer_url = viewer_url
-        self._statuses = node.subscriber(STATUS, SimulatorStatus, policy=latest())
         self._status: SimulatorStatus | None = None
-        self._lock = threading.Lock()
+        self._statuses = node.subscriber(STATUS, SimulatorStatus, self._on_status, policy=latest())
         with naming_port(port):
             self._server = ThreadingHTTPServer((HOST, port), self._handler())
         self._server.daemon_threads = True
@@ -70,14 +69,8 @@ class ControlPage:
 
     def status(self) -> dict[str, Any]:
         """Return how the simulator is doing; `phase` is empty if there is none."""
-        with self._lock:
-            try:
-                self._status = self._statuses.recv(0.0)
-            except TimeoutError:
-                if not self._statuses.sources():
-                    self._status = None
-            status = self._status
-        if status is None:
+        status = self._status
+        if status is None or not self._statuses.sources():
             return {"phase": "", "reason": "no simulator: start one with `neurosim serve`"}
         return {
             "phase": status.phase,
@@ -109,6 +102,9 @@ class ControlPage:
         except RuntimeError as error:
             return {"accepted": False, "reason": str(error)}
         return {"accepted": reply.accepted, "reason": reply.reason}
+
+    def _on_status(self, status: SimulatorStatus) -> None:
+        self._status = status
 
     def _handler(self) -> type[BaseHTTPRequestHandler]:
         page = self

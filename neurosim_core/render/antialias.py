@@ -32,16 +32,17 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.antialias_groups import group_kernels, make_lists, thread_counts
-from neurosim_core.render.coverage import (
-    APART,
+from neurosim_core.render.antialias_groups import (
     FACE_COUNT_MAX,
     RAY_COUNT,
     RAY_WIDTH,
     SAMPLE_COUNT,
     SHARPNESS,
     footprint_width,
+    group_kernels,
+    make_lists,
     ray_point,
+    thread_counts,
 )
 from neurosim_core.render.embree import packet_caster
 from neurosim_core.render.kernel_data import (
@@ -56,9 +57,9 @@ from neurosim_core.render.kernel_data import (
 )
 from neurosim_core.render.launch import launch_split
 from neurosim_core.render.outputs import RADIANCE, radiance_writer
-from neurosim_core.render.packet_shading import PACKET_TERMS, PixelBlock
 from neurosim_core.render.ray_intersection import UNFUSED, intersect_bodies, intersect_scene
-from neurosim_core.render.shading import pixel_shader, surface_shader
+from neurosim_core.render.raycast_packets import PACKET_TERMS, PixelBlock
+from neurosim_core.render.shading import APART, pixel_shader, surface_shader
 from neurosim_core.render.tiles import TilePlace, pose_finder, tile_locator
 
 _SIDE = 4

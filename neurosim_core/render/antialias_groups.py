@@ -18,23 +18,26 @@ from typing import Any
 import warp as wp
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.coverage import (
-    APART,
-    FACE_COUNT_MAX,
-    RAY_COUNT,
-    RAY_WIDTH,
-    SAMPLE_COUNT,
-    SHARPNESS,
-    footprint_width,
-    ray_point,
-)
 from neurosim_core.render.kernel_data import BodyData, Hit, RenderOutputs, RenderTerms, SceneData, ViewData
 from neurosim_core.render.outputs import radiance_writer, requested_outputs
 from neurosim_core.render.ray_intersection import UNFUSED, intersect_bodies, intersect_scene
 from neurosim_core.render.raycast import PIXEL_BOUNDS, turn_count
-from neurosim_core.render.shading import pixel_shader, surface_shader
+from neurosim_core.render.shading import APART, pixel_shader, surface_shader
 from neurosim_core.render.tiles import pose_finder, tile_locator
 
+SAMPLE_COUNT = 32
+"""Points of a pixel."""
+RAY_COUNT = 8
+"""Rays of a pixel that is rendered by rays."""
+RAY_WIDTH = wp.constant(RAY_COUNT**-0.5)
+"""Width of the footprint of one of them [px]."""
+FACE_COUNT_MAX = 48
+"""Most faces of a block of 4 x 4 pixels and the ring around it."""
+SHARPNESS = wp.constant(0.64)
+"""Width of the footprint that a texture is averaged over where a surface fills a pixel [px].
+
+A lookup blurs more than a mean does.
+"""
 INSTANTS = wp.constant(4)
 """Instants of a pixel in a block that shows one surface, of a thread."""
 COVER_BOUNDS = (64, 12)
@@ -48,6 +51,18 @@ _FAST = {"fast_math": True}
 Coverage = wp.types.vector(length=6, dtype=int)
 Met = wp.types.vector(length=8, dtype=float)
 MetPair = wp.types.vector(length=9, dtype=float)
+
+
+@wp.func_native(read_native(__file__, "sample_point", SAMPLES=RAY_COUNT))
+def ray_point(ray: int) -> wp.vec2:
+    """Return the point of a pixel that a ray goes through, from its centre [px]."""
+    ...
+
+
+@wp.func
+def footprint_width(point_count: float) -> float:
+    """Return the width of the footprint that a texture is averaged over where so many points show it [px]."""
+    return SHARPNESS * wp.sqrt(point_count / float(SAMPLE_COUNT))
 
 
 @wp.struct
@@ -226,7 +241,7 @@ def _part_shader(terms: RenderTerms) -> wp.Function:
     """Return the Warp function that finds the light of a face where a direction meets its plane.
 
     Its parameters: the scene; the face; origin and direction; the width of the footprint [rad]. For baked
-    light and filtered textures it is the program of packets on a CPU (`packet_shading.py`), for one ray.
+    light and filtered textures it is the program of packets on a CPU (`raycast_packets.py`), for one ray.
     """
     if terms.baked and not terms.finest_level:
         code = read_native(

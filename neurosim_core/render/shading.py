@@ -1,6 +1,6 @@
 # mypy: disable-error-code="index,misc,operator,arg-type,return-value,empty-body"
 # ruff: noqa: SIM102  (nested wp.static branches have a meaning in kernels)
-"""The light that a pixel receives from what its ray hits, ray by ray. See `packet_shading.py` for packets."""
+"""The light that a pixel receives from what its ray hits, ray by ray; `raycast_packets.py` shades packets."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of functions in closures as objects.
 
@@ -9,11 +9,12 @@ from functools import cache
 import warp as wp
 
 from neurosim_core.native_code import read_native
-from neurosim_core.render.coverage import APART
 from neurosim_core.render.kernel_data import BodyData, Hit, RenderTerms, SceneData
 from neurosim_core.render.lighting import ambient_light, point_light, reflect_light
 from neurosim_core.scene.materials import sample_finest, sample_nearest, sample_texture
 
+APART = wp.constant(0.42)
+"""How far from the middle of a long footprint the two lookups are whose mean is taken, of its length."""
 _COSINE_MIN = wp.constant(0.05)
 _OFFSET_M = wp.constant(1.0e-3)
 

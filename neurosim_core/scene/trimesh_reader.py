@@ -173,47 +173,39 @@ def _checked(path: Path, suffix: str) -> bytes:
         if len(data) >= 84 and len(data) == expected:
             return data
         if data.lstrip()[:5].lower() != b"solid" or b"\0" in data:
-            if len(data) < 84:
-                raise SceneError(
-                    f"{path}: cannot be read as STL: truncated, only {len(data)} bytes, or not one"
-                )
-            raise SceneError(
-                f"{path}: cannot be read as STL: truncated or not one; its header asks for {expected} bytes, "
-                f"{len(data)} are there"
-            )
+            _require(len(data) >= 84, path, suffix, f"truncated, only {len(data)} bytes, or not one")
+            asked = f"its header asks for {expected} bytes, {len(data)} are there"
+            _require(False, path, suffix, f"truncated or not one; {asked}")
     if suffix in ("stl", "stl_ascii"):
         text = _utf8(path, data)
-        if b"endsolid" not in text.lower():
-            raise SceneError(f"{path}: cannot be read as STL: truncated, there is no 'endsolid' at its end")
+        _require(b"endsolid" in text.lower(), path, "stl", "truncated, there is no 'endsolid' at its end")
         return text
     if suffix == "off":
         text = _utf8(path, data)
         lines = [line for line in (line.partition(b"#")[0].split() for line in text.splitlines()) if line]
         counts = [word for line in lines[:2] for word in line if word.isdigit()][:2]
         expected = sum(map(int, counts)) + (len(lines[0]) == 1) + 1
-        if len(lines) < expected:
-            raise SceneError(
-                f"{path}: cannot be read as OFF: truncated, {len(lines)} of {expected} lines are there"
-            )
+        missing = f"truncated, {len(lines)} of {expected} lines are there"
+        _require(len(lines) >= expected, path, suffix, missing)
         return text
     if suffix != "ply":
         return _utf8(path, data)
-    if not data.startswith(b"ply"):
-        raise SceneError(f"{path}: cannot be read as PLY: it does not start with 'ply'")
+    _require(data.startswith(b"ply"), path, suffix, "it does not start with 'ply'")
     head, mark, body = data.partition(b"end_header")
-    if not mark:
-        raise SceneError(f"{path}: cannot be read as PLY: truncated, its header does not end")
+    _require(bool(mark), path, suffix, "truncated, its header does not end")
     head = _utf8(path, head)
     if b"format ascii" in head:
         body = _utf8(path, body)
         words = [line.split() for line in head.splitlines()]
         expected = sum(int(w[2]) for w in words if w[:1] == [b"element"] and w[2:] and w[2].isdigit())
         there = sum(bool(line.strip()) for line in body.splitlines())
-        if there < expected:
-            raise SceneError(
-                f"{path}: cannot be read as PLY: truncated, {there} of {expected} lines are there"
-            )
+        _require(there >= expected, path, suffix, f"truncated, {there} of {expected} lines are there")
     return head + mark + body
+
+
+def _require(holds: bool, path: Path, suffix: str, why: str) -> None:
+    if not holds:
+        raise SceneError(f"{path}: cannot be read as {suffix.upper()}: {why}")
 
 
 def _appearance(

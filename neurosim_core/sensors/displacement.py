@@ -130,7 +130,8 @@ class DisplacementRule:
         rule.q_WC, rule.q_next_WC = zeros(rows, wp.quatd), zeros(rows, wp.quatd)
         rule.points = zeros((rows, self._probe_count), wp.vec4d)
         rule.seen = zeros((rows, self._probe_count), wp.vec3d)
-        rule.owner = zeros((rows, self._probe_count), int)
+        # On CUDA row 0 is compared before it is cast
+        rule.owner = wp.full(rule.points.shape, -1, dtype=int, device=device)
         self._rule = rule
         self._add_bodies(arrays, rows, motions)
         self._moved = rule.moved = zeros((rows, rows), float)
@@ -156,7 +157,7 @@ class DisplacementRule:
         self._body_poses = make_body_poses(rows + 1, self._body_count, self._device)
         self._body_rows: Any = wp.array(np.arange(rows + 1, dtype=np.int32), dtype=int, device=self._device)
         self._stamps = HostInput(wp.zeros((rows + 1, 1), dtype=wp.int64, device=self._device))
-        self._rule.body_mesh = moving.mesh
+        self._rule.body_mesh = moving.data.mesh
         self._rule.corners = wp.array(bounding_points(moving.bodies), dtype=wp.vec3d, device=self._device)
         self._rule.p_WO, self._rule.q_WO = self._body_poses.p_WO, self._body_poses.q_WO
 

@@ -67,35 +67,29 @@ class _Model:
     jump_ratio: float
     crease_cosine: float
     rays: wp.array3d[wp.vec3]
+    # Pictures, shape [slot, row, col]:
+    ranges: wp.array3d[float]
+    normals: wp.array3d[wp.vec3]
+    instance: wp.array3d[int]
 
 
 @wp.func
-def _edge_between(
-    model: _Model,
-    at: Element,
-    row_b: int,
-    col_b: int,
-    ray: wp.vec3,
-    ray_b: wp.vec3,
-    ranges: wp.array3d[float],
-    normals: wp.array3d[wp.vec3],
-    instance: wp.array3d[int],
-) -> int:
+def _edge_between(model: _Model, at: Element, row_b: int, col_b: int, ray: wp.vec3, ray_b: wp.vec3) -> int:
     """Return the label of the edge between two pixels, whose rays are given in W."""
-    r = ranges[at.slot, at.row, at.col]
-    r_b = ranges[at.slot, row_b, col_b]
+    r = model.ranges[at.slot, at.row, at.col]
+    r_b = model.ranges[at.slot, row_b, col_b]
     near = wp.min(r, r_b)
     if near == wp.inf:
         return 0
     if wp.max(r, r_b) == wp.inf:
         return 1
-    n = normals[at.slot, at.row, at.col]
-    n_b = normals[at.slot, row_b, col_b]
+    n = model.normals[at.slot, at.row, at.col]
+    n_b = model.normals[at.slot, row_b, col_b]
     apart = r_b * ray_b - r * ray
     off = wp.min(wp.abs(wp.dot(n, apart)), wp.abs(wp.dot(n_b, apart)))
     if off > model.jump_ratio * near:
         return 1
-    if instance[at.slot, at.row, at.col] != instance[at.slot, row_b, col_b]:
+    if model.instance[at.slot, at.row, at.col] != model.instance[at.slot, row_b, col_b]:
         return 2
     if wp.dot(n, n_b) < model.crease_cosine:
         return 3
@@ -106,9 +100,6 @@ def _edge_between(
 def _find_edges(
     first: int,
     model: _Model,
-    ranges: wp.array3d[float],
-    normals: wp.array3d[wp.vec3],
-    instance: wp.array3d[int],
     batch: Batch,
     # Out:
     edge_out: wp.array3d[int],
@@ -123,9 +114,9 @@ def _find_edges(
     for side in range(2):
         row_b = at.row + side
         col_b = at.col + 1 - side
-        if row_b < ranges.shape[1] and col_b < ranges.shape[2]:
+        if row_b < model.ranges.shape[1] and col_b < model.ranges.shape[2]:
             ray_b = wp.quat_rotate(q, model.rays[lens, row_b, col_b])
-            found = _edge_between(model, at, row_b, col_b, ray, ray_b, ranges, normals, instance)
+            found = _edge_between(model, at, row_b, col_b, ray, ray_b)
             if found > 0 and (label == 0 or found < label):
                 label = found
     edge_out[at.slot, at.row, at.col] = label
@@ -136,5 +127,6 @@ def make_edge_finder(limits: EdgeLimits, context: PictureContext) -> PixelProces
     model = _Model()
     model.jump_ratio, model.crease_cosine = limits.jump_ratio, float(np.cos(limits.crease_rad))
     model.rays = make_rays(context)
-    sources = [context.sources[name] for name in ("range", "normal", "instance")]
-    return PixelProcess(context, _find_edges, model, *sources, dtype=int)
+    model.ranges, model.normals = context.sources["range"], context.sources["normal"]
+    model.instance = context.sources["instance"]
+    return PixelProcess(context, _find_edges, model, dtype=int)

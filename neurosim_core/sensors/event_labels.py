@@ -221,7 +221,7 @@ class EventLabels:
         model.mesh, model.face_instance = scene.mesh_id, scene.data.face_instance
         if scene.bodies is not None:
             bodies = scene.bodies
-            model.motions, model.body_mesh = context.motions, bodies.mesh
+            model.motions, model.body_mesh = context.motions, bodies.data.mesh
             model.body_sphere, model.body_face = bodies.data.sphere, bodies.data.first_face
         if {"instance", "semantic"} & self._geometry:
             warn_of_patterns(context.name, [scene], classes)

@@ -87,9 +87,29 @@ class ImuConfig(StateSensorConfig):
 
     packet_type = ImuSample
 
-    def make(self, context: SamplerContext) -> "Imu":
-        """Return the sensor at work."""
-        return Imu(self, context)
+    def make(self, context: SamplerContext) -> StateSampler:
+        """Return the sensor at work; arrays are named as the fields of an `ImuSample`."""
+        vehicle, terms = context.vehicle, _terms(self)
+
+        def memory(term: str, *axes: int) -> Any:
+            shape = (vehicle.count if term in terms else 0, *axes)
+            return wp.zeros(shape, dtype=vec6d, device=vehicle.device)
+
+        return StateSampler(
+            context,
+            make_kernel(frozenset(terms)),
+            (
+                _model(self, gravity_m_s2=vehicle.config.gravity_m_s2, name=context.name),
+                vehicle.arrays.acceleration,
+                vehicle.arrays.angular_acceleration,
+                memory("walk"),
+                memory("instability", _PROCESSES),
+            ),
+            ImuSample,
+            outputs={"specific_force": wp.vec3d, "angular_rate": wp.vec3d},
+            terms=terms,
+            before=vehicle.accelerate,
+        )
 
 
 @wp.struct
@@ -181,39 +201,6 @@ def make_kernel(terms: frozenset[str]) -> Any:
         angular_rate_out[slot, world] = wp.vec3d(reading[3], reading[4], reading[5])
 
     return measure
-
-
-class Imu(StateSampler):
-    """The IMUs of all worlds; arrays are named as the fields of an `ImuSample`."""
-
-    def __init__(self, config: ImuConfig, context: SamplerContext) -> None:
-        self._vehicle = vehicle = context.vehicle
-        terms = _terms(config)
-
-        def memory(term: str, *axes: int) -> Any:
-            return wp.zeros(
-                (vehicle.count if term in terms else 0, *axes), dtype=vec6d, device=vehicle.device
-            )
-
-        super().__init__(
-            context,
-            make_kernel(frozenset(terms)),
-            (
-                _model(config, gravity_m_s2=vehicle.config.gravity_m_s2, name=context.name),
-                vehicle.arrays.acceleration,
-                vehicle.arrays.angular_acceleration,
-                memory("walk"),
-                memory("instability", _PROCESSES),
-            ),
-            ImuSample,
-            outputs={"specific_force": wp.vec3d, "angular_rate": wp.vec3d},
-            terms=terms,
-        )
-
-    def measure(self, slot: int) -> None:
-        """Measure all vehicles at their present state, of which the accelerations are computed here."""
-        self._vehicle.accelerate()
-        super().measure(slot)
 
 
 def _terms(config: ImuConfig) -> tuple[str, ...]:

@@ -127,6 +127,8 @@ class OpticalFlowConfig(CameraConfig, PictureSensorConfig):
 class _Model:
     around: Surroundings
     rays: wp.array3d[wp.vec3]
+    ranges: wp.array3d[float]
+    instance: wp.array3d[int]
     there: Views  # at the other time
     twist: wp.array[wp.spatial_vectord]
     # Of each view, of C with respect to T, the camera at the other time:
@@ -166,14 +168,7 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
     project_velocity = velocity_projector(kind)
 
     @wp.func
-    def measure_pixel(
-        index: int,
-        model: _Model,
-        ranges: wp.array3d[float],
-        instance: wp.array3d[int],
-        batch: Batch,
-        flow_out: wp.array3d[wp.vec3],
-    ):
+    def measure_pixel(index: int, model: _Model, batch: Batch, flow_out: wp.array3d[wp.vec3]):
         at = element_of(batch, index)
         slot = at.slot
         if slot < 0:
@@ -183,6 +178,7 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
         view = at.view
         here = batch.here
         there = model.there
+        ranges = model.ranges
         number = batch.lens_of_world[at.world]
         lens = model.around.lenses[number]
         ray_C = wp.vec3d(model.rays[number, row, col])
@@ -196,7 +192,7 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
         found = ranges[slot, row, col] < _FAR_M
         body = -1
         if wp.static("bodies" in terms):
-            body = wp.max(-1, instance[slot, row, col] - model.around.scene_instances)
+            body = wp.max(-1, model.instance[slot, row, col] - model.around.scene_instances)
         if wp.static("velocity" in terms):
             motion = model.twist[view]
             w_C = wp.vec3d(motion[3], motion[4], motion[5])
@@ -275,18 +271,16 @@ def _make_kernel(kind: str, terms: tuple[str, ...]) -> Any:
     def measure_flow(
         first: int,
         model: _Model,
-        ranges: wp.array3d[float],
-        instance: wp.array3d[int],
         batch: Batch,
         # Out:
         flow_out: wp.array3d[wp.vec3],
     ):
         index = first + wp.tid()
         if wp.static("listed" not in terms):
-            measure_pixel(index, model, ranges, instance, batch, flow_out)
+            measure_pixel(index, model, batch, flow_out)
         else:
             while index < model.unresolved_count[0]:
-                measure_pixel(model.unresolved[index], model, ranges, instance, batch, flow_out)
+                measure_pixel(model.unresolved[index], model, batch, flow_out)
                 index += model.thread_count
 
     return measure_flow
@@ -334,8 +328,8 @@ class FlowProcess(PixelProcess):
                 model.unresolved = wp.zeros(source.size, dtype=int, device=device)
                 model.thread_count = _LISTED_THREADS
                 variant, self._listed = (*variant, "list"), _make_kernel(kind, (*terms, "listed"))
-        sources = [context.sources[name] for name in ("range", "instance")]
-        super().__init__(context, _make_kernel(kind, variant), model, *sources, dtype=wp.vec3, terms=terms)
+        model.ranges, model.instance = context.sources["range"], context.sources["instance"]
+        super().__init__(context, _make_kernel(kind, variant), model, dtype=wp.vec3, terms=terms)
 
     def launch(self, views: PictureViews) -> None:
         """Make the flow of the pictures of a batch; launches only."""
@@ -348,8 +342,8 @@ class FlowProcess(PixelProcess):
             inputs = [self._model, self._focal_px, batch]
             wp.launch(_relate_views, dim=view_count, inputs=inputs, device=self.device)
         if self._focal_px:
-            nearest, (_, ranges, _) = self._model.nearest, self._inputs
-            inputs = [ranges, nearest]
+            nearest = self._model.nearest
+            inputs = [self._model.ranges, nearest]
             wp.launch_tiled(measure_tiles, dim=nearest.shape, inputs=inputs, block_dim=64, device=self.device)
         super().launch(views)
         if self._listed is not None:

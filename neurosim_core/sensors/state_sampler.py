@@ -276,6 +276,7 @@ class StateSampler(Sampler):
         terms: tuple[str, ...] = (),
         group_count: int = 1,
         late: LateConfig | None = None,
+        before: Callable[[], None] | None = None,
     ) -> None:
         """Allocate what it needs.
 
@@ -291,9 +292,10 @@ class StateSampler(Sampler):
             terms: Names of what is computed; with any there is a memory for errors.
             group_count: How many groups of errors there are, of three axes each.
             late: Delay and dropouts; before the first sample the state was that of it.
+            before: Launches what a measurement needs.
         """
         vehicle = context.vehicle
-        self.terms, self._packet = terms, packet
+        self.terms, self._packet, self._before = terms, packet, before
         self._count, self._device = vehicle.count, vehicle.device
         shape = (context.slot_count, self._count)
         if are_stacked:
@@ -342,6 +344,8 @@ class StateSampler(Sampler):
 
     def measure(self, slot: int) -> None:
         """Measure all vehicles at their present state."""
+        if self._before is not None:
+            self._before()
         for launch, slot_at, _ in self._launches:
             if slot_at is not None:
                 launch.set_param_at_index(slot_at, slot)

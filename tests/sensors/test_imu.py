@@ -12,7 +12,8 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.sensors.base import SamplerContext
-from neurosim_core.sensors.imu import CORRELATION_TIMES_S, Imu, ImuConfig
+from neurosim_core.sensors.imu import CORRELATION_TIMES_S, ImuConfig
+from neurosim_core.sensors.state_sampler import StateSampler
 from neurosim_core.vehicle import Multirotor, preset
 
 MS = 1_000_000
@@ -35,7 +36,7 @@ def isolated(device: str, **overrides) -> Multirotor:
 
 def make(
     config: ImuConfig, vehicle: Multirotor, *, seed: int = 0, name: str = "imu", slot_count: int = 1
-) -> Imu:
+) -> StateSampler:
     """The IMU of each vehicle, with seeds from 1,000 `seed` on."""
     seeds = wp.array(1000 * seed + np.arange(vehicle.count), dtype=wp.uint64, device=vehicle.device)
     active = wp.ones(vehicle.count, dtype=wp.int32, device=vehicle.device)
@@ -43,7 +44,7 @@ def make(
     return config.make(context)
 
 
-def sample(imu: Imu) -> SimpleNamespace:
+def sample(imu: StateSampler) -> SimpleNamespace:
     """The next sample of every vehicle, each [count, 3]."""
     imu.measure(0)
     return SimpleNamespace(**{name: array.numpy()[0].copy() for name, array in imu.arrays.items()})

@@ -18,7 +18,7 @@ auto turn_rays = [&](int term) {
     aim_rays(ray_of, ray[term]);
 };
 turn_rays(0);
-auto footprint_width = [](float points_shown) { // as in `coverage.py`
+auto footprint_width = [](float points_shown) { // as in `antialias_groups.py`
     return 0.01f * SHARPNESS * __builtin_elementwise_sqrt(points_shown / SAMPLES);
 };
 if constexpr (TIMED)
