@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import resource
 import signal
 import socket
 import subprocess
@@ -164,6 +165,20 @@ def test_view_without_a_display_says_what_to_do(flown, monkeypatch, capfd):
         monkeypatch.setenv(name, "")
     assert cli.main(["view", str(folder)]) == 1
     assert "there is no display to open a window on: `neurosim view FILE --web`" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["film.gif", "film.webp", "again.rrd"])
+def test_a_full_disk_is_told_with_the_name_of_what_is_saved(flown, tmp_path, capsys, name):
+    """A limit on the size of files acts like a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (5_000, before[1]))
+    try:
+        status = cli.main(["view", str(flown[0]), "--save", str(tmp_path / name)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert status == 1
+    assert f"cannot write {tmp_path / name}: File too large" in capsys.readouterr().err
+    assert not (tmp_path / name).exists()
 
 
 def test_a_full_disk_keeps_what_was_flown(tmp_path):

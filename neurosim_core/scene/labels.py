@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import functools
 import json
 import logging
 import re
@@ -46,20 +47,27 @@ def label_scenes(scenes: Sequence[Any], classes: Mapping[str, Sequence[str]] | N
 
 
 def warn_of_patterns(sensor: str, scenes: Sequence[Any], classes: Mapping[str, Sequence[str]] | None) -> None:
-    """Log each pattern of a sensor that no instance of any scene matches, and what there is."""
+    """Log each pattern of a sensor that no instance of any scene matches, and what there is; each once."""
     names = {
         name: _label_of(name, scene.scene.instance_labels)
         for scene in scenes
         for name in scene.instance_names
     }
+    known = sorted({*names.values()} - {UNLABELLED})
+    if not known:  # also the scene in which kernels are warmed up before there is another
+        return
     for kind, patterns in (classes or {}).items():
         for pattern in patterns:
             if not any(_matches(pattern, name, label) for name, label in names.items()):
-                known = ", ".join(sorted({*names.values()}))
-                _log.warning(
-                    f"sensor {sensor}: nothing is called {pattern!r}, as class {kind!r} says; there are: "
-                    f"{textwrap.shorten(known, _SHOWN_MAX, placeholder=' ...')}"
-                )
+                shown = textwrap.shorten(", ".join(known), _SHOWN_MAX, placeholder=" ...")
+                said = f"nothing is called {pattern!r}, as class {kind!r} says; there are: {shown}"
+                _warn_once(f"sensor {sensor}: {said}")
+
+
+@functools.cache
+def _warn_once(text: str) -> None:
+    """Log a text that each of several batches in flight would log."""
+    _log.warning(text)
 
 
 def _class_of(name: str, labels: Mapping[str, str], classes: Mapping[str, Sequence[str]] | None) -> str:

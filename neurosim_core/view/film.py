@@ -58,10 +58,14 @@ def save_film(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
                 panels.append(way.drawn(int(np.searchsorted(pose_stamps_ns, stamp_ns))))
             frames.append(_beside(panels))
     options: dict[str, Any] = {"quality": 60} if out.suffix == ".webp" else {}
-    with naming_file(out):
-        frames[0].save(
-            out, save_all=True, append_images=frames[1:], duration=round(1e3 / rate_hz), loop=0, **options
-        )
+    try:
+        with naming_file(out):
+            frames[0].save(
+                out, save_all=True, append_images=frames[1:], duration=round(1e3 / rate_hz), loop=0, **options
+            )
+    except BaseException:
+        out.unlink(missing_ok=True)  # what was cut off looks like a film
+        raise
 
 
 def _scaled(picture: NDArray[np.uint8]) -> Pillow.Image:
