@@ -12,9 +12,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 import neurosim_core as ns
-from neurosim_core.bench.dynamics_oracle import make_rotorpy_vehicle
 
 _NAMES = dict(zip(ns.vehicle.MultirotorState._fields, ("x", "v", "q", "w", "rotor_speeds"), strict=True))
+
+
+def rotorpy_parameters(config: ns.MultirotorConfig) -> dict[str, Any]:
+    """Return the parameters of an airframe under RotorPy's names."""
+    inertia = np.array(config.inertia_kg_m2)
+    return {
+        "mass": config.mass_kg,
+        **{f"I{'xyz'[i]}{'xyz'[j]}": inertia[i, j] for i in range(3) for j in range(i, 3)},
+        **{f"c_D{axis}": drag for axis, drag in zip("xyz", config.parasitic_drag_kg_m, strict=True)},
+        "num_rotors": config.rotor_count,
+        "rotor_pos": {f"r{k + 1}": np.array(hub) for k, hub in enumerate(config.rotor_position_m)},
+        "rotor_directions": np.array(config.rotor_direction),
+        "rotor_speed_min": config.rotor_speed_min_rad_s,
+        "rotor_speed_max": config.rotor_speed_max_rad_s,
+        "k_eta": config.thrust_coefficient_n_s2,
+        "k_m": config.torque_coefficient_n_m_s2,
+        "k_d": config.rotor_drag_kg,
+        "k_z": config.rotor_inflow_kg,
+        "k_h": config.translational_lift_kg_m,
+        "k_flap": config.flapping_kg_m,
+        "tau_m": config.motor_time_constant_s,
+    }
 
 
 @ns.register("vehicle", "rotorpy")
@@ -39,7 +60,9 @@ class RotorPyVehicle(ns.vehicle.HostVehicle):
 
     def __init__(self, config: ns.MultirotorConfig, context: ns.vehicle.VehicleContext) -> None:
         super().__init__(config, context)
-        self._vehicle = make_rotorpy_vehicle(config)
+        from rotorpy.vehicles.multirotor import Multirotor
+
+        self._vehicle = Multirotor(rotorpy_parameters(config))
 
     def move(
         self, state: ns.vehicle.MultirotorState, command: NDArray[np.float64], duration_s: float

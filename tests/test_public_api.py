@@ -40,13 +40,12 @@ def test_a_seam_lists_our_kinds_before_anything_else_is_used(seam, known):
 
 
 def test_examples_and_documents_need_no_other_import():
-    """One exception: parameters under RotorPy's names."""
     root = Path(__file__).parents[1]
     files = [root / "README.md", *root.glob("docs/**/*.md"), *root.glob("examples/*.py")]
     wanted = {
         name for file in files for name in re.findall(r"from (neurosim_core[\w.]*) import", file.read_text())
     }
-    assert wanted == {"neurosim_core.bench.dynamics_oracle"}
+    assert wanted == set()
 
 
 def test_an_unknown_name_is_said():
