@@ -21,11 +21,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from neurosim_core import __version__
 from neurosim_core.config import SimulationConfig, load_config, to_yaml
 from neurosim_core.flight_report import FlightReport, print_plan, print_report
-from neurosim_core.packets import Packet
+from neurosim_core.packets import Events, Packet
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
 from neurosim_core.scene.reader import SceneReader
-from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.signals import stop_at_signals
 from neurosim_core.sim.model import Model, make_model
 from neurosim_core.sim.rollout import run_model, warm_flight
@@ -114,7 +113,7 @@ def fly(
     report.setup_wall_s = dict(state.wall_s)
     print_plan(console, model)
 
-    sees_events = any(isinstance(sensor, EventSensorConfig) for sensor in config.sensors.values())
+    sees_events = any(sensor.packet_type is Events for sensor in config.sensors.values())
     stop = threading.Event()
     begin = time.perf_counter()
 

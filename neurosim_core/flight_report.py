@@ -1,4 +1,4 @@
-"""What is said of a flight: what is going to be flown, and what came of it."""
+"""The texts that `neurosim run` prints: the plan before the flight, and the report after it."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from neurosim_core.vehicle.multirotor import MultirotorVehicleConfig
 
 @dataclass(kw_only=True, eq=False)
 class FlightReport:
-    """What is told about a flight besides its packets."""
+    """Times and counts of a flight, for the report."""
 
     setup_s: float = 0.0
     """Wall-clock time until the first packet, from the beginning of the command [s]."""
     libraries_s: float = 0.0
-    """What of it had passed before the settings were there [s]."""
+    """The part of `setup_s` before the settings were known [s]."""
     setup_wall_s: dict[str, float] = field(default_factory=dict)
-    """What of `State.wall_s` had passed by then."""
+    """`State.wall_s` at the first packet."""
     flight_s: float = 0.0
     """Wall-clock time of the flight, recording included [s]."""
     closing_s: float = 0.0
@@ -56,7 +56,7 @@ class FlightReport:
         return self.simulated_ns / NS_PER_S / self.flight_s if self.flight_s > 0.0 else 0.0
 
     def note(self, packet: Packet) -> None:
-        """Take one packet."""
+        """Count one packet."""
         count = self.packet_counts.get(packet.sensor, 0) + 1
         self.packet_counts[packet.sensor] = count
         self.lost_counts[packet.sensor] = packet.sequence + 1 - count
@@ -69,7 +69,7 @@ class FlightReport:
 
 
 def print_plan(console: Console, model: Model) -> None:
-    """Say what is going to happen, before it takes its time."""
+    """Print what is about to be flown."""
     scene, config = model.scene, model.config
     size = " x ".join(f"{length:.1f}" for length in np.ptp(scene.bounds_m, axis=0))
     samples = model.path.evaluate(np.linspace(0, model.duration_ns, 1001).astype(np.int64))
@@ -117,7 +117,7 @@ def print_report(console: Console, model: Model, state: State, report: FlightRep
     if model.config.sensors:
         counts_of = (_describe_packets(name, report, state) for name in model.config.sensors)
         facts.add_row("packets", ", ".join(counts_of))
-    if any(isinstance(sensor, EventSensorConfig) for sensor in model.config.sensors.values()):
+    if any(sensor.packet_type is Events for sensor in model.config.sensors.values()):
         rate = report.event_count / simulated_s / 1e6 if simulated_s else 0.0
         dropped = counts["events dropped"]
         facts.add_row("events", f"{report.event_count:,} ({rate:.2f} M/s), {dropped:,} dropped")

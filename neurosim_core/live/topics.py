@@ -32,7 +32,9 @@ from cortex.messages import (
     Trigger,
     VelocityCommand,
 )
+from neurosim_core.packets import Odometry
 from neurosim_core.record.header import SensorDescription
+from neurosim_core.registry import find
 
 SIMULATION = "/simulation"
 STATUS = "/status"
@@ -77,7 +79,7 @@ def body_frame(vehicle: str) -> str:
 
 
 def sensor_frame(vehicle: str, sensor: SensorDescription) -> str:
-    """Name of a sensor's frame: the optical frame of a camera, the body frame for odometry."""
-    if sensor.kind in ("odometry", "state_estimate"):
+    """Name of a sensor's frame: the optical frame of a camera, the body frame where packets are odometry."""
+    if find("sensor", sensor.kind).packet_type is Odometry:  # type: ignore[attr-defined]
         return body_frame(vehicle)
     return f"{vehicle}/{sensor.name}" + ("" if sensor.intrinsics is None else "_optical_frame")
