@@ -1,4 +1,4 @@
-"""How a publisher waits for reliable readers that have no room: one thread at a time, without the lock."""
+"""Back-pressure: a publisher waits for full reliable readers; one thread at a time, without the lock."""
 
 from __future__ import annotations
 

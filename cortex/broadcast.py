@@ -65,7 +65,8 @@ class Hello(NamedTuple):
 
     socket: int
     page: int
-    bell: int
+    wakeup: int
+    """The eventfd that wakes the reader; the bell of WIRE.md."""
 
     def close(self) -> None:
         """Let go of them."""
@@ -97,8 +98,8 @@ class Listener:
         unheard, self._unheard = self._unheard[-WAITING_MAX:], []
         for fd in unheard:
             try:
-                asked, number, page, bell = native.hear(fd)
-                self._heard[asked, number] = Hello(fd, page, bell)
+                asked, number, page, wakeup = native.hear(fd)
+                self._heard[asked, number] = Hello(fd, page, wakeup)
             except BlockingIOError:
                 self._unheard.append(fd)
             except OSError as error:

@@ -1,4 +1,4 @@
-"""What the registry and the directories of the nodes share: times of their protocol, limits, sockets."""
+"""Shared by the registry and the directories of the nodes: times of their protocol, limits, sockets."""
 
 from __future__ import annotations
 

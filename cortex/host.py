@@ -1,4 +1,4 @@
-"""What the processes of one host share: the runtime directory, its locks, and the files of each node.
+"""Files that the processes of one host share: the runtime directory, its locks, and the files of each node.
 
 Everything Cortex leaves in the file system lies in one directory that only its user can enter. A file of a
 node is stale when nobody holds the node's lock, which the kernel lets go of however the node died.

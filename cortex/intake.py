@@ -1,4 +1,4 @@
-"""What a subscriber reads from its sockets, and keeps until it is asked for: a bounded queue."""
+"""The bounded queue of a subscriber: messages read from its sockets, until they are asked for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the fields of a message lie in the fixed block of its body (WIRE.md, section 5.1)."""
+"""The offsets of the fields of a message in the fixed block of its body (WIRE.md, section 5.1)."""
 
 from __future__ import annotations
 

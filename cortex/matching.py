@@ -1,4 +1,4 @@
-"""Who is connected to whom: a node's subscribers to publishers, its clients to services."""
+"""The connections of a node: its subscribers to publishers, its clients to services."""
 
 from __future__ import annotations
 

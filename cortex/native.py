@@ -1,4 +1,4 @@
-"""What the C module, where there is one, needs to know of a message type."""
+"""The description of a message type for the C module, where there is one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the records of all nodes say: topics, and publishers that come and go."""
+"""The network as the records of all nodes describe it: topics, and publishers that come and go."""
 
 from __future__ import annotations
 

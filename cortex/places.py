@@ -1,4 +1,4 @@
-"""Where nodes are: the addresses that a node offers, and which of another's addresses to use."""
+"""The addresses of nodes: those that a node offers, and which of another's addresses to use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a subscriber asks of its stream: the last n, only the newest, or every message."""
+"""The policy of a subscriber: the last n, only the newest, or every message."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the values of a message lie in its body and in its memory: the table that `body_walk.h` goes through.
+"""The places of a message's values in its body and in its memory: the table that `body_walk.h` goes through.
 
 The C module has such a table of a class (`native.py`), generated C++ of a struct (`cppgen.py`).
 """

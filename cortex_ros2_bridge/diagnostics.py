@@ -1,4 +1,4 @@
-"""What the bridge says of itself on /diagnostics: one status for each route, once a second."""
+"""The status of the bridge on /diagnostics: one status for each route, once a second."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What connects a route: feeds, publishers and subscriptions that routes share, and where vehicles are."""
+"""The connections of routes: shared feeds, publishers and subscriptions, and places of vehicles."""
 
 from __future__ import annotations
 

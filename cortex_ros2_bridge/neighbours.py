@@ -1,4 +1,4 @@
-"""What others do, and settings ask for, that does not work or is done twice: for /diagnostics and the log."""
+"""Conflicts with other nodes and with settings, for /diagnostics and the log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What follows `--ros-args`: names, remappings, parameters and log levels, for every backend alike.
+"""The arguments after `--ros-args`: names, remappings, parameters and log levels, for every backend alike.
 
     -r [NODE:]FROM:=TO    FROM: a topic, a service, __node or __ns        -p [NODE:]NAME:=VALUE
     --params-file FILE    --log-level LEVEL

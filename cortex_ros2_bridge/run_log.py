@@ -1,4 +1,4 @@
-"""What a simulator does that a user of ROS wants to read on the bridge's console."""
+"""Events of a simulator that a user of ROS wants to read on the bridge's console."""
 
 from __future__ import annotations
 

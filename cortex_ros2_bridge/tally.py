@@ -1,4 +1,4 @@
-"""What a route has done, and what went wrong: counted always, said once a second at most."""
+"""Counts of a route, and of its errors: counted always, said once a second at most."""
 
 from __future__ import annotations
 

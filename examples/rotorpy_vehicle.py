@@ -47,7 +47,7 @@ class RotorPyVehicleConfig(ns.vehicle.VehicleConfig):
     """Name of the airframe."""
 
     def airframe(self) -> ns.MultirotorConfig:
-        """Return what controllers take it for."""
+        """Return the multirotor that controllers assume."""
         return ns.preset(self.preset)
 
     def make(self, context: ns.vehicle.VehicleContext) -> RotorPyVehicle:

@@ -1,4 +1,4 @@
-"""How to install optional libraries: the one place that writes the command for error messages."""
+"""Optional libraries: error messages say here, and only here, how to install them."""
 
 from __future__ import annotations
 

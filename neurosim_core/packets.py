@@ -1,4 +1,4 @@
-"""What a run yields: one frozen record per measurement, stamped in integer simulation time.
+"""The packets of a run: one frozen record per measurement, stamped in integer simulation time.
 
 A sensor declares its packet as a frozen dataclass. The annotations are its schema, from which recordings,
 pictures, plots and messages are derived, so that no other file has to know the class:

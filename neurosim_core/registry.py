@@ -1,4 +1,4 @@
-"""What can be extended: a table kind -> class for each seam, to which other packages add by an entry point.
+"""The registry of plug-ins: a table kind -> class for each seam; others are added by entry points.
 
 A package adds its own sensors, vehicles, ... by registering classes in a module that an entry point of the
 group `neurosim.plugins` names; the module is imported when a kind is asked for that is not of Neurosim:

@@ -1,4 +1,4 @@
-"""What Ctrl-C and `kill` do for the time of a block."""
+"""Handlers of SIGINT (Ctrl-C) and SIGTERM (`kill`) for the duration of a block."""
 
 from __future__ import annotations
 

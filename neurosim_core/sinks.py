@@ -1,4 +1,4 @@
-"""Where the packets of a flight go, by kind: files, viewers, other processes; `sinks` of the settings."""
+"""Sinks for the packets of a flight, by kind: files, viewers, other processes; `sinks` of the settings."""
 
 from __future__ import annotations
 
@@ -82,8 +82,8 @@ class SinkConfig(Settings):
     """A library that it needs, and the extra that brings it: where that is missing, the sink is left out."""
     is_live: ClassVar[bool] = True
     """Whether it takes part in the recording of a live run (`neurosim serve --record`)."""
-    gives_way: ClassVar[bool] = False
-    """Whether it is given up when it, or the disk, cannot be written any more, and the flight goes on."""
+    is_optional: ClassVar[bool] = False
+    """Whether the flight goes on without it, when it or the disk cannot be written any more."""
     again: ClassVar[str] = ""
     """What makes it again from flight.h5, where it was given up; {folder} is that of the flight."""
 
@@ -154,7 +154,7 @@ class RerunSinkConfig(SinkConfig):
     kind: Literal["rerun"] = "rerun"
     library = ("rerun", "view")
     is_live = False
-    gives_way = True
+    is_optional = True
     again = "`neurosim view {folder} --save FILE.rrd` makes it from flight.h5"
 
     def file(self, stem: str) -> str:
@@ -181,7 +181,7 @@ class OverviewSinkConfig(SinkConfig):
     kind: Literal["overview"] = "overview"
     library = ("matplotlib", "view")
     is_live = False
-    gives_way = True
+    is_optional = True
 
     def file(self, stem: str) -> str:
         """Return the name of the picture."""
@@ -354,7 +354,7 @@ class Sinks:
         try:
             act(sink)
         except OSError as error:
-            if self._settings[name].gives_way:
+            if self._settings[name].is_optional:
                 self._give_up(name, str(error))
                 return
             kept_ns: int | None = getattr(sink, "kept_ns", None)
@@ -364,13 +364,13 @@ class Sinks:
             raise OSError(f"{error}; {kept}") from error
 
     def _make_room(self) -> None:
-        """Give up files that give way before they take the last room of the disk from others."""
+        """Give up optional files before they take the last space of the disk from others."""
         self._checked_s = time.monotonic()
-        giving = [name for name in self._open if self._settings[name].gives_way and self._has_file(name)]
-        if not giving or len(giving) == len(self._open):
+        optional = [name for name in self._open if self._settings[name].is_optional and self._has_file(name)]
+        if not optional or len(optional) == len(self._open):
             return
         if shutil.disk_usage(self._context["folder"]).free < _ROOM_BYTES:
-            for name in giving:
+            for name in optional:
                 self._give_up(name, f"less than {_ROOM_BYTES / 1e6:g} MB are left on the disk")
 
     def _give_up(self, name: str, why: str) -> None:

@@ -146,7 +146,7 @@ print("deaf", flush=True)
 signal.pause()
 """)
     with NeurosimProcess("serve", None, log=tmp_path / "log") as process:
-        wait_for(lambda: "deaf" in process.last_words())
+        wait_for(lambda: "deaf" in process.last_lines())
         process.check()
         assert process.resident_bytes() > 1_000_000
         with pytest.raises(

@@ -30,7 +30,7 @@ class ListSinkConfig(SinkConfig):
     kind: Literal["test_list"] = "test_list"
     fails_at: int = -1
     error: Literal["OSError", "KeyError"] = "OSError"
-    gives_way = False
+    is_optional = False
 
     def open(self, context: SinkContext) -> ListSink:
         """Return the sink."""
@@ -44,7 +44,7 @@ class WeakSinkConfig(ListSinkConfig):
     """The same, and the flight goes on without it."""
 
     kind: Literal["test_weak"] = "test_weak"  # type: ignore[assignment]
-    gives_way = True
+    is_optional = True
 
 
 class ListSink:
@@ -161,7 +161,7 @@ def test_a_live_run_that_would_record_nothing_is_refused(scene, tmp_path):
         Recorder({"drone": tmp_path}, {"drone": ns.make_model(config)})
 
 
-def test_one_that_gives_way_does_not(scene, tmp_path, capsys):
+def test_an_optional_one_does_not(scene, tmp_path, capsys):
     ns.fly(settings(scene, mine={"kind": "test_weak", "fails_at": 5}), tmp_path)
     assert "mine is given up: the line is dead" in capsys.readouterr().out
     assert OPENED[0].closed == [False]

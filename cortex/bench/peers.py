@@ -1,4 +1,4 @@
-"""What a child process is asked to do, and the libraries that do it, each used as by a careful hand.
+"""The jobs of a child process, and the libraries that do them, each used as its manual advises.
 
 Where bytes are sent, a message is a header of 64 bytes (sequence, stamp, room) and the payload, of which the
 receiver gets a NumPy view.

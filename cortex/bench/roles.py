@@ -1,4 +1,4 @@
-"""What each child process of a measurement does from its first to its last report."""
+"""The roles of the child processes of a measurement, from their first to their last report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a subscriber counts: messages, gaps, order, payload; and what it costs in time and memory."""
+"""Counts of a subscriber: messages, gaps, order, payload; and its cost in time and memory."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What the command `cortex` does, one module for each kind of job; `cortex.cli` has its options."""
+"""The subcommands of `cortex`, one module for each kind of job; `cortex.cli` has its options."""

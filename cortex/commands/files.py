@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 from cortex.commands.interrupts import raise_again, raise_at_signals
-from cortex.commands.session import Patience, UsageError, hint, open_node
+from cortex.commands.session import UsageError, WaitingHint, hint, open_node
 from cortex.commands.text import bytes_of, number_of, plain, seconds, table
 from cortex.log import Log, Player, Recorder, RecordStats, open_log
 from cortex.policy import keep_last
@@ -44,7 +44,7 @@ def record(options: argparse.Namespace) -> int:
             compression=options.compression,
         )
         hint(f"recording into {options.output}; Ctrl-C ends it")
-        missing = {topic: Patience(node, topic) for topic in options.topic}
+        missing = {topic: WaitingHint(node, topic) for topic in options.topic}
         _wait_for_end(recorder, told_to_stop, options.duration, missing)
         stats = recorder.close()
     _report(options.output, stats)
@@ -56,7 +56,7 @@ def record(options: argparse.Namespace) -> int:
 
 
 def _wait_for_end(
-    recorder: Recorder, told_to_stop: list[int], duration_s: float | None, missing: dict[str, Patience]
+    recorder: Recorder, told_to_stop: list[int], duration_s: float | None, missing: dict[str, WaitingHint]
 ) -> None:
     began_s = report_s = time.monotonic()
     warned = False
@@ -65,10 +65,10 @@ def _wait_for_end(
         now_s = time.monotonic()
         if duration_s is not None and now_s - began_s >= duration_s:
             break
-        for topic, patience in missing.items():
+        for topic, waiting_hint in missing.items():
             if (seen := recorder.stats.topics.get(topic)) is not None and seen.written:
-                patience.heard()
-            patience.check()
+                waiting_hint.heard()
+            waiting_hint.check()
         if now_s - report_s >= _REPORT_S:
             report_s = now_s
             stats = recorder.stats

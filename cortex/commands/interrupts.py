@@ -1,4 +1,4 @@
-"""What Ctrl-C and SIGTERM do to a command: an exception ends it, and the second signal ends the process."""
+"""Ctrl-C and SIGTERM in a command: an exception ends it, and the second signal ends the process."""
 
 from __future__ import annotations
 

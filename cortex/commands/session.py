@@ -1,4 +1,4 @@
-"""What the commands share: a node of their own, and words for when there is nothing to see."""
+"""Shared by the commands: a node of their own, and words for when there is nothing to see."""
 
 from __future__ import annotations
 
@@ -96,8 +96,8 @@ def _is_registry_there(domain: int | None) -> bool:
     return True
 
 
-class Patience:
-    """Says, once, that a topic has no publisher yet, when that has lasted a second."""
+class WaitingHint:
+    """Prints a hint, once, if no message of a topic has come for a second after it was made."""
 
     def __init__(self, node: Node, topic: str) -> None:
         self._node = node
@@ -105,11 +105,11 @@ class Patience:
         self._due_s = time.monotonic() + 1.0
 
     def heard(self) -> None:
-        """Something has come: there is nothing to say any more."""
+        """A message has come: print no hint any more."""
         self._due_s = float("inf")
 
     def check(self) -> None:
-        """Say it if it is time."""
+        """Print the hint if it is due."""
         if time.monotonic() < self._due_s:
             return
         self._due_s = float("inf")

@@ -16,7 +16,7 @@ import numpy as np
 
 from cortex.codec import MalformedMessage, codec_of
 from cortex.commands.interrupts import raise_again
-from cortex.commands.session import CommandError, Patience, hint, open_node
+from cortex.commands.session import CommandError, WaitingHint, hint, open_node
 from cortex.commands.text import bytes_of, message_lines, number_of, rate, seconds, to_plain
 from cortex.link import Info
 from cortex.node import Node
@@ -36,7 +36,7 @@ def echo(options: argparse.Namespace) -> int:
     """`cortex echo`."""
     arrays = "none" if options.no_arrays else "full" if options.full else "short"
     with open_node(options) as node, _subscribe(node, options.topic, 64) as subscriber:
-        patience = Patience(node, options.topic)
+        waiting_hint = WaitingHint(node, options.topic)
         shown = 0
         try:
             while options.count is None or shown < options.count:
@@ -44,9 +44,9 @@ def echo(options: argparse.Namespace) -> int:
                 try:
                     info, body, schema = subscriber.recv_raw(_WAIT_S)
                 except TimeoutError:
-                    patience.check()
+                    waiting_hint.check()
                     continue
-                patience.heard()
+                waiting_hint.heard()
                 try:
                     message = codec_of(type_from_schema(schema)).decode(body)
                 except MalformedMessage as error:
@@ -75,9 +75,9 @@ def _print_json(info: Info, message: dict[str, Any]) -> None:
 def show_rate(options: argparse.Namespace) -> int:
     """`cortex hz`: a line of statistics each second, over the last `--window` seconds."""
     with open_node(options) as node, _subscribe(node, options.topic, _QUEUE) as subscriber:
-        patience = Patience(node, options.topic)
+        waiting_hint = WaitingHint(node, options.topic)
         window: deque[_Second] = deque(maxlen=max(1, round(options.window)))
-        for printed, second in enumerate(_by_second(node, subscriber, patience, by_stamp=options.stamp)):
+        for printed, second in enumerate(_by_second(node, subscriber, waiting_hint, by_stamp=options.stamp)):
             window.append(second)
             if printed % _HEAD_EVERY == 0:
                 print(_line("rate", "std", "max", "bandwidth", "size", "delay p50", "p99", "lost"))
@@ -103,7 +103,7 @@ class _Second:
 
 
 def _by_second(
-    node: Node, subscriber: Subscriber[Any], patience: Patience, *, by_stamp: bool
+    node: Node, subscriber: Subscriber[Any], waiting_hint: WaitingHint, *, by_stamp: bool
 ) -> Iterator[_Second]:
     second: _Second | None = None
     before = 0
@@ -120,9 +120,9 @@ def _by_second(
         try:
             info, _, _ = subscriber.recv_raw(_WAIT_S if second is None else min(left_ns * 1e-9, _WAIT_S))
         except TimeoutError:
-            patience.check()
+            waiting_hint.check()
             continue
-        patience.heard()
+        waiting_hint.heard()
         if by_stamp and info.stamp_ns is None:
             raise CommandError(f"the messages of {info.topic} have no stamp_ns")
         previous, last[info.source] = last.get(info.source), info

@@ -1,4 +1,4 @@
-"""What a recording is made of: the names that writer and reader share.
+"""The format of recordings: the names that writer and reader share.
 
 A recording is an MCAP file. Each publisher of a topic has a channel of its own, so that its sequence numbers
 mean something: message encoding `cortex` (the body of WIRE.md, section 5), schema encoding `cortex-json` (the

@@ -1,4 +1,4 @@
-"""What a multirotor is told to do, from the rotors up to a pose.
+"""Commands of a multirotor, from the rotors up to a pose.
 
 Each command holds until the next one. A thrust is the sum over all rotors, along the body's z axis.
 """

@@ -1,4 +1,4 @@
-"""What sensors measure."""
+"""Messages of sensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What describes a run rather than the robot: its clock, its parameters, what there is to say."""
+"""Messages about a run rather than the robot: its clock, its parameters, its log."""
 
 from __future__ import annotations
 

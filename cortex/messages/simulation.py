@@ -1,4 +1,4 @@
-"""How a simulator is controlled, and what it says of itself."""
+"""Messages to control a simulator, and its status."""
 
 from __future__ import annotations
 

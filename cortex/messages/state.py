@@ -1,4 +1,4 @@
-"""Where things are and how they move."""
+"""Messages of poses, velocities and paths."""
 
 from __future__ import annotations
 

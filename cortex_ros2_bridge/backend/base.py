@@ -1,4 +1,4 @@
-"""What the bridge asks of ROS 2: publishers and subscriptions of serialised messages (CDR)."""
+"""The interface of a ROS 2 backend: publishers and subscriptions of serialised messages (CDR)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What environment variables of ROS 2 and of Cyclone DDS ask for."""
+"""Settings from the environment variables of ROS 2 and of Cyclone DDS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What conversions know besides a message, and what they refuse."""
+"""The context of conversions besides the message, and the error of what they refuse."""
 
 from __future__ import annotations
 

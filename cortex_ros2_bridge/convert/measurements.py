@@ -1,4 +1,4 @@
-"""What small sensors measure, as standard messages; in Cortex their types are known by schema only."""
+"""Measurements of small sensors, as standard messages; in Cortex their types are known by schema only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a simulator says of itself."""
+"""Conversion of a simulator's status."""
 
 from __future__ import annotations
 

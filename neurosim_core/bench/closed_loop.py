@@ -61,7 +61,7 @@ def measure_loop(config: engine.SimulationConfig, *, seconds: float) -> Row:
     with (
         own_runtime() as folder,
         NeurosimProcess("serve", config, log=folder / "serve.log") as simulator,
-        simulator.told(),
+        simulator.with_output(),
     ):
         trace = engine.answer_images(
             vehicle=next(iter(config.vehicles)),

@@ -1,4 +1,4 @@
-"""What a scene does not need is left out: kernels, memory, libraries and time of runs, small and large.
+"""Runs pay only for what they use: kernels, memory, libraries and time of small and large runs.
 
 Each case flies in a process of its own; what it holds and has imported is counted there when it has flown.
 """

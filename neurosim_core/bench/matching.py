@@ -1,6 +1,6 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-untyped-call,call-overload"
 # mypy: disable-error-code="untyped-decorator,assignment"
-"""How two streams of events differ: by the cheapest way to turn one into the other.
+"""The difference of two streams of events: the cheapest way to turn one into the other.
 
 The events of one pixel and polarity are a spike train. To delete or insert an event costs 1, to shift one
 within a window costs in proportion to the time. What is deleted is missing, what is inserted is spurious.

@@ -1,4 +1,4 @@
-"""The processes of the live stack, started to be measured, among themselves, and ended again."""
+"""Processes of the live stack for measurements: start, check and end them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neurosim_core.bench.engine import ProbeError, SimulationConfig, to_yaml
 
 _RUNTIME = "CORTEX_RUNTIME_DIR"
 _VARIABLES = (_RUNTIME, "CORTEX_REGISTRY", "CORTEX_LISTEN", "CORTEX_KEYS")
-"""What says where nodes meet."""
+"""The variables that decide which nodes find each other."""
 _PARENT_MAX = 40
 """Longest directory of temporary files [characters]: paths of sockets end at 107."""
 _STOP_S = 5.0
@@ -28,7 +28,7 @@ class ProcessEnded(RuntimeError):
 
 @contextlib.contextmanager
 def own_runtime() -> Iterator[Path]:
-    """Keep the nodes that are started within from meeting others; yield a folder, removed at the end."""
+    """Isolate the nodes of a block from all other nodes; yield a folder, which is removed at the end."""
     parent = tempfile.gettempdir()
     folder = Path(tempfile.mkdtemp(prefix="nsb-", dir=parent if len(parent) <= _PARENT_MAX else "/tmp"))
     before = {name: os.environ.pop(name, None) for name in _VARIABLES}
@@ -62,18 +62,18 @@ class NeurosimProcess:
         """Raise `ProcessEnded` if it has ended."""
         status = self._process.poll()
         if status is not None:
-            raise ProcessEnded(f"`neurosim {self._command}` ended with status {status}; {self.last_words()}")
+            raise ProcessEnded(f"`neurosim {self._command}` ended with status {status}; {self.last_lines()}")
 
     @contextlib.contextmanager
-    def told(self) -> Iterator[None]:
-        """Let the errors of probes within tell what this process said last."""
+    def with_output(self) -> Iterator[None]:
+        """Add the last output of this process to the errors of probes in a block."""
         try:
             yield
         except ProbeError as error:
-            raise ProbeError(f"{error}; `neurosim {self._command}`: {self.last_words()}") from None
+            raise ProbeError(f"{error}; `neurosim {self._command}`: {self.last_lines()}") from None
 
-    def last_words(self) -> str:
-        """Return the last lines that it said, for an error message."""
+    def last_lines(self) -> str:
+        """Return the last lines of its output, for an error message."""
         lines = self._log.read_text(errors="replace").strip().splitlines()[-5:]
         return "it said:\n" + ("\n".join(f"  {line}" for line in lines) or "  (nothing)")
 
@@ -83,7 +83,7 @@ class NeurosimProcess:
             status = self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             late = f"`neurosim {self._command}` did not end within {timeout_s:g} s"
-            raise TimeoutError(f"{late}; {self.last_words()}") from None
+            raise TimeoutError(f"{late}; {self.last_lines()}") from None
         if status != 0:
             self.check()
 

@@ -1,4 +1,4 @@
-"""What a benchmark returns, as plain data: chapters of claims, tables and plots, and their files.
+"""The result of a benchmark, as plain data: chapters of claims, tables and plots, and their files.
 
 Nothing here draws: `render_report` turns chapters into a terminal's tables, pictures and a page.
 """

@@ -54,7 +54,7 @@ def measure(options: Options) -> Chapter:
             simulator.check()
             controller.check()
 
-        with simulator.told():
+        with simulator.with_output():
             trace = probe.listen(
                 seconds, resident=lambda: [p.resident_bytes() for p in (simulator, controller)], check=check
             )

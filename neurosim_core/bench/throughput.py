@@ -1,4 +1,4 @@
-"""How fast whole steps are, what their parts take alone, and a naive event camera on the same frames.
+"""The speed of whole steps and of their parts, and of a naive event camera on the same frames.
 
 Everything is measured on one device in one run. A row that fails says why, and the next one is measured.
 """

@@ -1,4 +1,4 @@
-"""What every kind of controller is: settings, what the engine asks of it, and a base for those in Python."""
+"""The interface of controllers: settings, the methods that the engine calls, and a base class in Python."""
 
 from __future__ import annotations
 

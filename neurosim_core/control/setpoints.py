@@ -1,4 +1,4 @@
-"""What an outside controller asks for, as objects with names and units in place of bare rows."""
+"""Setpoints of an external controller, as objects with names and units in place of bare rows."""
 
 from __future__ import annotations
 

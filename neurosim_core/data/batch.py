@@ -1,4 +1,4 @@
-"""What learning takes: windows of events with the ground truth at their ends, alone and in batches."""
+"""Samples for learning: windows of events with the ground truth at their ends, alone and in batches."""
 
 from __future__ import annotations
 

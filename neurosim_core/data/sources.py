@@ -1,4 +1,4 @@
-"""Flights that come once, from the first window to the last: simulated while they are read."""
+"""Sources of samples that are simulated while they are read, from the first window to the last."""
 
 from __future__ import annotations
 
@@ -77,10 +77,10 @@ class RunSource:
 
 
 class WorldsSource:
-    """Worlds that are stepped together along their paths; their windows come in turns.
+    """Worlds that are stepped together along their paths; their windows alternate.
 
-    Each call of `samples` resets the worlds; the second and later ones with new seeds. `simulation`: the
-    worlds; they are used up to the end of `duration_s`.
+    Each call of `samples` resets the worlds. The first call takes the seeds of `simulation`; each later call
+    takes new seeds. The worlds fly until the end of `duration_s`.
     """
 
     def __init__(self, simulation: Simulation) -> None:
@@ -92,22 +92,22 @@ class WorldsSource:
         """See `SampleSource.samples`."""
         worlds = self._simulation
         sensors = choose_sensors(fields_of(worlds.model.config), config, source="worlds")
-        cutters = [PacketWindows(config, sensors, source=f"world {n}") for n in range(worlds.count)]
+        windows_of_worlds = [PacketWindows(config, sensors, source=f"world {n}") for n in range(worlds.count)]
         seeds = None if self._calls == 0 else np.array(worlds.seeds) + worlds.count
         self._calls += 1
         observation, now_ns = worlds.reset(seed=seeds), 0
         while True:
             packets = packets_of(worlds, observation, range(worlds.count), sensors.values())
-            for cutter, own in zip(cutters, packets, strict=True):
+            for windows, own in zip(windows_of_worlds, packets, strict=True):
                 for packet in own:
-                    yield from cutter.add(packet)
+                    yield from windows.add(packet)
             if now_ns >= worlds.model.duration_ns:
                 break
             observation = worlds.rollout(1)
             now_ns += worlds.duration_ns
-        for cutter in cutters:
-            yield from cutter.end()
-        self.skipped_count = sum(cutter.skipped_count for cutter in cutters)
+        for windows in windows_of_worlds:
+            yield from windows.end()
+        self.skipped_count = sum(windows.skipped_count for windows in windows_of_worlds)
 
 
 def packets_of(

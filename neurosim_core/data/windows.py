@@ -29,8 +29,8 @@ _ENCODINGS = {"32FC1": "depth", "32FC2": "flow", "rgb8": "rgb", "mono8": "rgb"}
 _US_NS = 1000
 AT_STAMP = ("depth", "flow", "rgb", "pose")
 """Fields that need a packet at exactly the end of a window."""
-_IN_VAIN = 20
-"""After so many windows without ground truth, and none with it, an error says why."""
+_SKIPPED_MAX = 20
+"""An error is raised after so many windows without ground truth, if none had it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +137,7 @@ class PacketWindows:
             ValueError: Windows were cut, but none has its ground truth.
         """
         yield from self._complete(ended=True)
-        if not self._found and self.skipped_count >= _IN_VAIN:
+        if not self._found and self.skipped_count >= _SKIPPED_MAX:
             names = [name for name in AT_STAMP if self._config.takes(name)]
             raise ValueError(no_ground_truth(self._source, " or ".join(names), self._config))
 

@@ -1,4 +1,4 @@
-"""What recordings of an event camera in still and in stepping light say of its pixels.
+"""Statistics of the pixels of an event camera, from recordings in still and in stepping light.
 
 Every function takes events and returns raw numbers, some of them biased: `sensor` simulates cameras, measures
 them here as well, and so finds the settings that give the numbers of the recording.

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,valid-type,assignment"
-"""What episodes draw of their camera and light: how it is mounted, its lens, how bright it is."""
+"""Randomisation of the camera and the light of episodes: mount, lens, brightness."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels as objects.
 

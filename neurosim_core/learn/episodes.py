@@ -1,6 +1,6 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,no-any-return,call-overload,valid-type"
 # mypy: disable-error-code="assignment,return-value"
-"""Where episodes begin, and what a policy may know of a vehicle, in float32: drawn and written on the device.
+"""Initial states of episodes, and observations of a vehicle, in float32: drawn and written on the device.
 
 All numbers of a world come from its own seed: nothing of a world depends on its neighbours.
 """

@@ -1,4 +1,4 @@
-"""How well a policy does: an episode in each world of scenes that it may not have seen; and films of one."""
+"""Evaluation of a policy: an episode in each world, in scenes that it may not have seen; films of one."""
 
 from __future__ import annotations
 

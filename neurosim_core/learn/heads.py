@@ -1,4 +1,4 @@
-"""What dense prediction tells of each pixel: its target, its loss, and the metrics of the field.
+"""Heads of dense prediction: the target of each pixel, its loss, and the metrics of the field.
 
 References, depth: Hidalgo-Carrio, Gehrig, Scaramuzza (2020), Learning Monocular Dense Depth from Events, for
 the multi-scale gradient loss and the cut-off distances; Eigen, Puhrsch, Fergus (2014), for the

@@ -1,4 +1,4 @@
-"""What episodes draw."""
+"""The parameters that are randomised in each episode."""
 
 from __future__ import annotations
 

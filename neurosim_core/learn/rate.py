@@ -1,4 +1,4 @@
-"""How fast an environment is, and a training in it."""
+"""The speed of an environment, and of a training in it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a task is: one class that says what is observed, what is rewarded, and when an episode ends."""
+"""The base class of tasks: it says what is observed, what is rewarded, and when an episode ends."""
 
 from __future__ import annotations
 

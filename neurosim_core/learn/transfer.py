@@ -1,4 +1,4 @@
-"""How well a policy does under conditions that it was not trained for."""
+"""Evaluation of a policy under conditions that it was not trained for."""
 
 from __future__ import annotations
 

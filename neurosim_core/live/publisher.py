@@ -1,4 +1,4 @@
-"""What a vehicle publishes: its sensors, its state, the poses of its sensors, deliveries of its links."""
+"""The topics of a vehicle: its sensors, its state, the poses of its sensors, deliveries of its links."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the simulator and a renderer in another process say to each other."""
+"""Messages between the simulator and a renderer in another process."""
 
 from __future__ import annotations
 

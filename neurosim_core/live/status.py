@@ -1,4 +1,4 @@
-"""What a simulator says of itself: what it flies, what time it is, and how it is doing."""
+"""The status of a simulator: its vehicles, its time, its speed and its losses."""
 
 from __future__ import annotations
 

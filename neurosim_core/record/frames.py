@@ -1,4 +1,4 @@
-"""What processes of a recording send to each other: pickled contents, and behind them arrays as they are."""
+"""Messages between the processes of a recording: pickled contents, and behind them arrays as they are."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What keeps a device busy: streams, graphs, pinned memory, and wall-clock time by phase."""
+"""Tools that keep a device busy: streams, graphs, pinned memory, and wall-clock time by phase."""

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined,type-arg"
-"""How the host keeps a GPU busy: streams, graphs of launches that come again, copies that need no wait.
+"""CUDA from the host: streams, graphs of repeated launches, copies that need no wait.
 
 On a CPU a launch returns when it has finished, and all of this does nothing.
 
@@ -53,7 +53,7 @@ def make_stream(device: Any, *, high_priority: bool = False) -> wp.Stream | None
 
 
 class _On:
-    """Makes a stream the present one; `wp.ScopedStream` also chooses the device, and takes twice as long."""
+    """Makes a stream the current one; `wp.ScopedStream` also sets the device, and takes twice as long."""
 
     def __init__(self, stream: wp.Stream, after: bool) -> None:
         self._stream = stream
@@ -68,7 +68,10 @@ class _On:
 
 
 def use_stream(stream: wp.Stream | None, *, after: bool = True) -> AbstractContextManager[Any]:
-    """Launch what follows on a stream (None: stay), after what the present one holds unless fences say it."""
+    """Launch the kernels of a block on a stream; None: on the current one.
+
+    With `after` the stream first waits for all launches of the current one; without it, fences order them.
+    """
     return nullcontext() if stream is None else _On(stream, after)
 
 
@@ -82,7 +85,7 @@ class Fence:
         """A stream whose launches come after it anyway."""
 
     def set(self, stream: wp.Stream | None = None) -> None:
-        """Put it behind what a stream holds; None: the present one."""
+        """Record it behind all launches of a stream; None: of the current one."""
         if self._event is not None:
             self._behind = stream or self._device.stream
             self._behind.record_event(self._event)
@@ -112,7 +115,7 @@ class GraphCache:
         self.dropped_count = 0
 
     def run(self, key: Hashable, launch: Callable[[], Any], *, stream: wp.Stream | None = None) -> None:
-        """Do what `launch` does, on a stream (None: the present one); same key, same launches and arguments.
+        """Do what `launch` does, on a stream (None: the current one); same key, same launches and arguments.
 
         It is called the first time, which compiles and warms up, and the second time to record it. What it
         returns is kept as long as the graph: arrays that nothing else holds. On a stream fences say what it

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,operator,arg-type"
-"""Where there is room: distance to the scene on a voxel grid, what can be reached, collisions in flight.
+"""The free space of a scene: distances on a voxel grid, what can be reached, collisions in flight.
 
 The distance is unsigned and exact at voxel centres (nearest point on any triangle). It is 1-Lipschitz, so a
 value at one place bounds it at another; every guarantee of this module and of the planner rests on that and

@@ -1,4 +1,4 @@
-"""What the objects of scenes are: classes from settings, from what files say, or from names."""
+"""The classes of objects in scenes: from settings, from scene files, or from names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is in a scene: figures, a table of them, and a picture with the plan of its free space."""
+"""The report of a scene: figures, a table of them, and a picture with the plan of its free space."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a scene is once it is loaded or generated: triangles, materials and lights.
+"""A scene that is loaded or generated: triangles, materials and lights.
 
 Metres, z up, linear light.
 """

@@ -1,4 +1,4 @@
-"""What a scene file says, before it becomes a scene: parts in file units and file axes."""
+"""The contents of a scene file before it becomes a scene: parts in file units and file axes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the faces of a mesh meet: edges, plane surfaces, shading normals, corners."""
+"""The topology of a mesh: edges, plane surfaces, shading normals, corners."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the vehicle flies: paths, and what makes them."""
+"""Paths of vehicles, and the planners that make them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a vehicle can follow: proven bounds of speed, thrust and tilt rate, and the time scale that fits them.
+"""Paths that a vehicle can follow: proven bounds of speed, thrust and tilt rate, and a time scale that fits.
 
 Bounds come from Bernstein control points: a polynomial stays in the convex hull of its control points, so the
 largest control point bounds it everywhere, not at samples only. Pieces are cut into parts first, where the

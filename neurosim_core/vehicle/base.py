@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined"
-"""What every kind of vehicle is: its settings, what the engine asks of it, and a base for those in Python."""
+"""The interface of vehicles: settings, the methods that the engine calls, and a base class in Python."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Vehicle(Protocol):
     """The vehicles of all worlds. What they do only launches, on a device."""
 
     config: MultirotorConfig
-    """What planners, controllers and IMUs take it for."""
+    """The multirotor that planners, controllers and IMUs assume."""
     count: int
     """Number of worlds, N."""
     device: Any
@@ -104,7 +104,7 @@ class HostVehicle:
         """Allocate the state.
 
         Args:
-            config: What planners, controllers and IMUs take it for.
+            config: The multirotor that planners, controllers and IMUs assume.
             context: What it is made for.
 
         Raises:

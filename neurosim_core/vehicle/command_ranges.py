@@ -1,4 +1,4 @@
-"""What a vehicle can be asked for: ranges of commands, from its physics or from the settings."""
+"""The ranges of a vehicle's commands, from its physics or from the settings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is shown of one event camera: windows of events as pictures, as a surface, and as points.
+"""Views of one event camera: windows of events as pictures, as a surface, and as points.
 
 In a surface the last event of a pixel fades by exp(-age / tau), on black: brighter orange, darker blue.
 """

@@ -1,4 +1,4 @@
-"""What the overview of a flight shows, collected from its packets in bounded memory."""
+"""The data of a flight's overview, collected from its packets in bounded memory."""
 
 from __future__ import annotations
 

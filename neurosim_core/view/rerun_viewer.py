@@ -73,12 +73,12 @@ class RerunViewer:
         if web:
             query = urllib.parse.urlencode({"url": self.data_url}, safe=":/")
             self.page_url = f"http://{HOST}:{page_port}/?{query}"
-        self._words = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the process)
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the process)
         self._process = subprocess.Popen(
             [_executable(), *options],
             stdin=subprocess.DEVNULL,
-            stdout=self._words,
-            stderr=self._words,
+            stdout=self._output,
+            stderr=self._output,
             env={**os.environ, "RERUN_APP_ONLY": "true"},
             start_new_session=True,  # Ctrl-C is for us, and we end it
             preexec_fn=end_with_parent(signal.SIGTERM),
@@ -105,7 +105,7 @@ class RerunViewer:
     def check(self) -> bool:
         """Return whether the viewer is still there; False: its window was closed."""
         if self._process.poll():
-            raise ViewerEnded(f"the viewer ended with status {self._process.poll()}:\n{self._last_words()}")
+            raise ViewerEnded(f"the viewer ended with status {self._process.poll()}:\n{self._last_lines()}")
         return not self.ended
 
     def close_recording(self, logger: Any) -> None:
@@ -127,7 +127,7 @@ class RerunViewer:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     self._process.wait(_END_S)
         self._process.wait()
-        self._words.close()
+        self._output.close()
 
     def __enter__(self) -> RerunViewer:
         return self
@@ -140,7 +140,7 @@ class RerunViewer:
         while waiting():
             if self.ended:
                 raise ViewerEnded(
-                    f"the viewer ended at once, with status {self._process.poll()}:\n{self._last_words()}"
+                    f"the viewer ended at once, with status {self._process.poll()}:\n{self._last_lines()}"
                 )
             with contextlib.suppress(OSError), socket.create_connection((HOST, port), timeout=0.1):
                 return
@@ -148,9 +148,9 @@ class RerunViewer:
                 raise ViewerEnded(f"the viewer does not listen on port {port} after {_START_S:g} s")
             time.sleep(0.02)
 
-    def _last_words(self) -> str:
-        self._words.seek(0)
-        lines = self._words.read().decode(errors="replace").strip().splitlines()
+    def _last_lines(self) -> str:
+        self._output.seek(0)
+        lines = self._output.read().decode(errors="replace").strip().splitlines()
         return "\n".join(lines[-5:])
 
 

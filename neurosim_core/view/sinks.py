@@ -1,4 +1,4 @@
-"""What a flight leaves for the eye: its Rerun file and its overview, as sinks."""
+"""Sinks that draw a flight: its Rerun file and its overview."""
 
 from __future__ import annotations
 
