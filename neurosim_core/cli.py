@@ -277,7 +277,7 @@ def _add_print_config(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_live(parser: argparse.ArgumentParser) -> None:
-    """What a simulator needs to know besides."""
+    """Options of a simulator besides its settings."""
     _add_print_config(parser)
     parser.add_argument(
         "--lockstep", action="store_true", help="wait for the command of every control period"

@@ -48,7 +48,7 @@ class FlightReport:
     """Stamp [ns] and p_WB [m] of every odometry packet."""
     interrupted: bool = False
     failure: Exception | None = None
-    """What ended the flight early."""
+    """The error that ended the flight early."""
 
     @property
     def real_time_factor(self) -> float:
@@ -225,7 +225,7 @@ def _describe_collisions(report: FlightReport) -> str:
 
 
 def _terms(model: Model, state: State) -> dict[str, tuple[str, ...]]:
-    """What each kernel computes, beyond what every run needs."""
+    """Return the optional terms that each kernel computes."""
     terms: dict[str, tuple[str, ...]] = {"dynamics": state.vehicle.terms}
     terms |= {name: sampler.terms for name, sampler in state.samplers.items()}
     for group, seeing in zip(model.groups, state.groups, strict=True):

@@ -42,7 +42,7 @@ def _name(cls: type) -> str:
 
 @dataclass(frozen=True)
 class FieldSpec:
-    """What a field of a packet holds; part of its annotation."""
+    """The unit, shape and meaning of a packet's field; part of its annotation."""
 
     shape: tuple[int | str, ...] = ()
     """Lengths of the axes. A number is fixed. An upper-case name, such as "H", is a length that the first
@@ -335,7 +335,7 @@ class Image(Packet):
     data: Annotated[NDArray[Any], FieldSpec("H", "W", "...")]
     """Pixels, row-major, shape [H, W] or [H, W, C]."""
     encoding: Annotated[ImageEncoding, FieldSpec(constant=True)]
-    """What a pixel is."""
+    """Encoding of a pixel."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -361,7 +361,7 @@ class PointCloud(Packet):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImuSample(Packet):
-    """What an inertial measurement unit reads at its stamp, in its own frame S."""
+    """The reading of an inertial measurement unit at its stamp, in its own frame S."""
 
     specific_force: Annotated[NDArray[np.float64], FieldSpec(3, unit="m/s^2")]
     """Acceleration minus gravity at the mount, in S [m/s^2], shape [3]; at rest it points up with 9.81."""
@@ -401,7 +401,7 @@ class Collision(Packet):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Delivery(Packet):
-    """What a simulated link did to one message; `sensor` is "<link>_link", `stamp_ns` when it was sent."""
+    """Delivery of a message by a simulated link; `sensor` is "<link>_link", `stamp_ns` when it was sent."""
 
     display: ClassVar[str] = "delay"
 

@@ -55,16 +55,16 @@ class Sink(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SinkContext:
-    """What a sink is opened for."""
+    """The context that a sink is opened in."""
 
     name: str
     """The sink's name in the settings."""
     folder: Path
     """Of the flight; it exists."""
     stem: str
-    """What files of the flight begin with: flight; after a reset of a live run flight-2, ..."""
+    """Prefix of the files of the flight: flight; after a reset of a live run flight-2, ..."""
     model: Model
-    """What is flown."""
+    """The model of the flight."""
     header: RecordingHeader
     """Settings, sensors and path, as a recording has them."""
     on_stop: list[Callable[[], object]] = field(default_factory=list)

@@ -55,7 +55,7 @@ class Flight:
 
     @property
     def duration_s(self) -> float:
-        """How long it lasts [s]."""
+        """Duration [s]."""
         return len(self.commands) * HOLD_NS * 1e-9
 
     def held(self, hold: int) -> Array:

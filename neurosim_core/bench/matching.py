@@ -90,7 +90,7 @@ class Alignment(NamedTuple):
     distance: float
     """Sum of the distances of all trains."""
     error_us: NDArray[np.float32]
-    """How much later each event of the reference is in the other stream [us], nan where it is missing."""
+    """Delay of each event of the reference in the other stream [us], nan where it is missing."""
     spurious_count: int
     """Events of the other stream that are none of the reference."""
 

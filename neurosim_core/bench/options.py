@@ -39,7 +39,7 @@ def _option(text: str, default: Any = None, **argument: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What a question is asked with; what is None is up to the question."""
+    """Options of a benchmark; None leaves the choice to the benchmark."""
 
     quick: bool = _option("a small version; its figures are rough", False, action="store_true")
     scene: Path | None = _option("mesh file; default: a generated scene", type=Path, metavar="FILE")  # noqa: RUF009

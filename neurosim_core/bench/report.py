@@ -33,7 +33,7 @@ class Table:
     rows: Sequence[Mapping[str, Any]]
     """Values by heading, which says the unit; a value that is missing, None or nan reads as unknown."""
     note: str = ""
-    """What a reader must know."""
+    """Remarks for the reader."""
 
     @property
     def headings(self) -> list[str]:
@@ -88,7 +88,7 @@ class Claim:
     reference: str
     """The law, closed form, publication or independent program that the limit rests on."""
     measured: str
-    """What was measured, with unit; or why it was not."""
+    """The measured value with its unit, or why there is none."""
     met: bool | None
     """None: not measured here."""
 

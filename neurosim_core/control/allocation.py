@@ -21,7 +21,7 @@ _ONE = wp.constant(wp.float64(1.0))
 
 @wp.struct
 class Motors:
-    """What all rotors of a vehicle share."""
+    """Parameters that all rotors of a vehicle share."""
 
     speed_min_rad_s: wp.float64  # Lowest speed [rad/s]
     speed_max_rad_s: wp.float64  # Highest speed [rad/s]

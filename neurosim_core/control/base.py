@@ -21,7 +21,7 @@ from neurosim_core.vehicle.arrays import MultirotorState
 
 
 class PathController(Protocol):
-    """What flies the vehicles of all worlds along their paths."""
+    """A controller, which flies the vehicles of all worlds along their paths."""
 
     def update(self, arrays: Any) -> None:
         """Write `arrays.rotor_speed_command` from the state in `arrays`, at each control period.
@@ -38,14 +38,14 @@ class PathController(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ControllerContext:
-    """What a controller is made for."""
+    """The context that a controller is made in."""
 
     airframe: MultirotorConfig
-    """What the vehicles are taken for."""
+    """The multirotor that the vehicles are assumed to be."""
     paths: Sequence[Path]
     """The path of each world, shape [N]."""
     device: Any
-    """Where the states of the vehicles are."""
+    """Device of the states of the vehicles."""
 
 
 class ControllerConfig(Settings):

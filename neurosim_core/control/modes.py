@@ -58,7 +58,7 @@ CommandMode = Literal["motor_speeds", "rates", "attitude", "velocity", "position
 
 @wp.struct
 class _Order:
-    """What one of the vehicles is to do."""
+    """The command of one vehicle."""
 
     path: PathArrays
     setpoint: wp.array2d[wp.float64]

@@ -135,14 +135,14 @@ class VehicleState:
     orientation: wp.quatd  # q_WB, xyzw
     body_rate: wp.vec3d  # w_WB in B [rad/s]
     air_acceleration: wp.vec3d
-    """What the air is known to add to the acceleration, in W [m/s^2]; 0 where it is not compensated."""
+    """The known acceleration by the air, in W [m/s^2]; 0 where it is not compensated."""
     air_torque: wp.vec3d
-    """What the air is known to add to the torque, in B [N m]; 0 where it is not compensated."""
+    """The known torque of the air, in B [N m]; 0 where it is not compensated."""
 
 
 @wp.struct
 class Wrench:
-    """What the rotors are asked for."""
+    """The command of the rotors."""
 
     thrust_N: wp.float64  # Collective thrust along z_B [N]
     torque: wp.vec3d  # Torque in B [N m]

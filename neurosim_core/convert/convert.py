@@ -103,7 +103,7 @@ class _Stack(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class ConversionPlan:
-    """What is decided before the first frame."""
+    """The plan of a conversion, made before the first frame."""
 
     crop: Crop
     """What is taken of the pictures."""
@@ -125,7 +125,7 @@ class ConversionPlan:
 
 @dataclass(kw_only=True)
 class Conversion:
-    """What came of a video."""
+    """The result of a conversion."""
 
     source: Description
     plan: ConversionPlan

@@ -31,7 +31,7 @@ _LIMITED_RANGE = 1
 
 
 class Frame(NamedTuple):
-    """What the camera would have seen at an instant."""
+    """The picture of the camera at an instant."""
 
     stamp_ns: int
     """As the source tells it, from any origin [ns]."""
@@ -41,7 +41,7 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Description:
-    """What is known about a source before its frames are read."""
+    """Properties of a source that are known before its frames are read."""
 
     name: str
     width: int
@@ -51,11 +51,11 @@ class Description:
     frame_count: int | None
     """As far as the source tells."""
     light: str
-    """How its numbers become light, in words."""
+    """The conversion of its numbers to light, in words."""
     codes: NDArray[np.float64]
     """Luminance of all numbers that a grey may have, in their order; none if light itself is stored."""
     notes: tuple[str, ...] = ()
-    """What was assumed or left out, one sentence each."""
+    """Assumptions and omissions, one sentence each."""
 
 
 def open_source(
@@ -297,7 +297,7 @@ def _estimate(stream: Any, container: Any) -> int | None:
 
 
 class _Decoder(NamedTuple):
-    """What makes luminance of the frames of a video."""
+    """The conversion from the frames of a video to luminance."""
 
     luminance: Callable[[Any], NDArray[np.float32]]
     light: str
@@ -305,7 +305,7 @@ class _Decoder(NamedTuple):
     codes: NDArray[np.float64]
     """See `Description`."""
     notes: tuple[str, ...]
-    """What was assumed or left out."""
+    """Assumptions and omissions."""
 
 
 def _make_decoder(frame: Any, codec: Any, transfer: str, path: Path) -> _Decoder:

@@ -27,7 +27,7 @@ _INK, _COLORS = "#1d2530", ("#1c7ed6", "#e8590c", "#2f9e44", "#845ef7", "#e03131
 
 @dataclass(kw_only=True)
 class EventStats:
-    """What is counted of one file, in one pass and bounded memory."""
+    """Counts of one file, made in one pass and bounded memory."""
 
     name: str
     width: int
@@ -54,7 +54,7 @@ class EventStats:
     frequency: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     """Of `spectrum` [cycles/px]."""
     notes: tuple[str, ...] = ()
-    """What a user should know about the file."""
+    """Remarks on the file for the user."""
 
     @property
     def duration_s(self) -> float:

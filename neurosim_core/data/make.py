@@ -45,7 +45,7 @@ _FORMAT = 1
 
 @dataclass(kw_only=True)
 class FlightStats:
-    """What the card tells about a flight."""
+    """The facts of a flight for the card."""
 
     duration_s: float = 0.0
     """Simulated time [s]."""

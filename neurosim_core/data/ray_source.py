@@ -113,7 +113,7 @@ class RaySource:
 
 
 class _Simulator:
-    """What an actor is."""
+    """Simulates flights in an actor of Ray."""
 
     def __init__(self, config: SimulationConfig, first: int, flights: int | None) -> None:
         limit_cores(1)

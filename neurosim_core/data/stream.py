@@ -128,10 +128,10 @@ class Dataset:
 
 
 class Position(NamedTuple):
-    """Where a stream is."""
+    """The position in a stream."""
 
     epoch: int
-    """How often it has been read to its end."""
+    """Number of times that it has been read to its end."""
     batch: int
     """The next batch of this epoch."""
 

@@ -73,7 +73,7 @@ class Stimulus:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observation:
-    """What was measured of one camera, real or simulated, and what can be drawn of it."""
+    """Measurements of one camera, real or simulated, and their curves for plots."""
 
     numbers: dict[str, Any]
     """Raw statistics, by the setting that they tell."""
@@ -96,7 +96,7 @@ class SensorFit:
     real: Observation
     simulated: Observation
     notes: list[str] = field(default_factory=list)
-    """What could not be told, and why."""
+    """The parameters that could not be estimated, and why."""
 
 
 def make_pixel(settings: Mapping[str, Any]) -> EventCameraConfig:

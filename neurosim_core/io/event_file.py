@@ -47,7 +47,7 @@ def check_new(path: Path, *, overwrite: bool) -> None:
 
 
 class EventSource:
-    """What a format has to read the events of one camera.
+    """The interface of a reader: it reads the events of one camera from a file of one format.
 
     Attributes:
         size: Width and height of the sensor [px], where the file says them.
@@ -85,7 +85,7 @@ class EventSource:
 
 
 class EventSink(Protocol):
-    """What a format has to write them; made of the path, and width and height of the sensor [px]."""
+    """The interface of a writer; it is made with the path, and width and height of the sensor [px]."""
 
     def write(self, events: EventArrays) -> None:
         """Append events, which are sorted, on the sensor, and one at least.

@@ -19,7 +19,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(kw_only=True)
 class Transfer:
-    """What was copied."""
+    """Counts of the copied events."""
 
     event_count: int = 0
     packet_count: int = 0

@@ -84,7 +84,7 @@ class DenseConfig:
 
     @property
     def head(self) -> Head:
-        """What is predicted."""
+        """The predicted quantity."""
         return HEADS[self.task]
 
     def net(self) -> DenseNet:
@@ -100,7 +100,7 @@ class Windows(NamedTuple):
     start_ns: Sequence[int]
     stamp_ns: Sequence[int]
     voxel: Tensor
-    """What the network sees, shape [B, bins, H, W]."""
+    """Input of the network, shape [B, bins, H, W]."""
     target: Tensor
     """As the head says, shape [B, C, H, W]."""
 
@@ -204,7 +204,7 @@ def evaluate(
     sums: Tensor | None = None
     memory, flight = None, None
     due: list[tuple[Tensor, Tensor]] = []
-    """What was predicted and is not yet compared, with what was seen."""
+    """Predictions that are not yet compared, with their inputs."""
     with torch.no_grad():
         for windows in tested:
             for name, voxel, target in zip(windows.source, windows.voxel, windows.target, strict=True):
@@ -403,7 +403,7 @@ def _in_background(step: Callable[[], bool]) -> Iterator[Callable[[], bool]]:
 
 
 class _Fit(NamedTuple):
-    """What training took."""
+    """Time and steps of a training."""
 
     steps: int
     waited_share: float

@@ -171,7 +171,7 @@ class Env:
 
     @property
     def parameters(self) -> dict[str, torch.Tensor]:
-        """What differs between the worlds in their present episodes, by name of `Randomisation`, [N, ...].
+        """Parameters of the worlds in their present episodes, by name of `Randomisation`, [N, ...].
 
         They are tensors of the device; what `step` returned as `seed` gives them again.
         """
@@ -189,7 +189,7 @@ class Env:
 
     @property
     def surface_card(self) -> dict[str, Any]:
-        """What the event surfaces are: the name of their class and its settings."""
+        """The type of event surfaces: the name of their class and its settings."""
         if self._surface is None:
             return {}
         config = self._surface.config

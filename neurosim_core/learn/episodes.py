@@ -53,7 +53,7 @@ _NOISE = wp.constant(wp.uint32(stream_id("learn/noise")))
 
 @dataclass(frozen=True, kw_only=True)
 class StartConfig:
-    """How vehicles begin: anywhere in free space, with any heading."""
+    """Initial states of vehicles: anywhere in free space, with any heading."""
 
     clearance_m: float = 0.6
     """Least distance to the scene at the start and at the goal [m]."""

@@ -29,7 +29,7 @@ Actor = Callable[[Observations, torch.Tensor], torch.Tensor]
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """What came of an episode in each world."""
+    """The result of an episode in each world."""
 
     episodes: int
     metrics: dict[str, float]

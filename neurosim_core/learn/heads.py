@@ -32,7 +32,7 @@ _RATE_MIN = 1e-4
 
 
 class Head(ABC):
-    """What is predicted of each pixel, and how well; targets and predictions are [..., C, H, W]."""
+    """The prediction of each pixel, and its quality; targets and predictions are [..., C, H, W]."""
 
     field: ClassVar[str]
     """Of a batch: where the target comes from."""
@@ -145,7 +145,7 @@ def _neighbours(known: Tensor, axis: int) -> Tensor:
 
 
 class DepthErrors(NamedTuple):
-    """How far predictions are off, over all pixels with a depth."""
+    """Errors of predictions, over all pixels with a depth."""
 
     abs_rel: float
     """Mean of |error| / depth."""
@@ -209,7 +209,7 @@ def _off(predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class FlowErrors(NamedTuple):
-    """How far predictions are off, over all pixels whose flow is known."""
+    """Errors of predictions, over all pixels whose flow is known."""
 
     endpoint_px: float
     """Mean endpoint error [px]."""
@@ -267,7 +267,7 @@ class FutureHead(Head):
 
 
 class FutureErrors(NamedTuple):
-    """How well events were foretold."""
+    """The quality of predicted events."""
 
     bits: float
     """Cross entropy of a pixel, a polarity and a window [bit]."""

@@ -26,7 +26,7 @@ _VECTOR_SIZE = 10
 
 
 class Command(NamedTuple):
-    """What a pilot commands."""
+    """The command of a pilot."""
 
     thrust_n: float
     """Collective thrust [N]."""

@@ -23,7 +23,7 @@ def _perceptron(sizes: Sequence[int]) -> nn.Sequential:
 
 
 class Critic(nn.Module):
-    """What PPO needs besides the mean of actions: their spread, and the value of what is seen."""
+    """The outputs that PPO needs besides the mean of actions: their spread, and the value of observations."""
 
     def __init__(
         self,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class Randomisation:
-    """What differs from episode to episode and from world to world, besides where it begins."""
+    """Parameters that differ from episode to episode and from world to world, besides the initial state."""
 
     thrust_factor: tuple[float, float] = (0.9, 1.1)
     """Range of thrust per commanded thrust: a battery, or a mass that is not known; not of velocities."""

@@ -26,7 +26,7 @@ Observations = dict[str, torch.Tensor]
 
 @dataclass(kw_only=True, eq=False)
 class View:
-    """What a task sees of all worlds at the end of a step: views of the same memory in each step.
+    """The state of all worlds at the end of a step, as a task sees it: views of the same memory in each step.
 
     Vectors in B are in the body frame.
     """

@@ -71,7 +71,7 @@ def parameters_of(settings: Sequence[str]) -> Parameters:
 
 
 class SensorRates:
-    """How many messages a second sensors publish, from one status to the next."""
+    """Messages a second of each sensor, from one status to the next."""
 
     def __init__(self) -> None:
         self._statuses: deque[SimulatorStatus] = deque()
@@ -213,7 +213,7 @@ def _ms(duration_ns: int) -> str:
 
 
 class Dashboard:
-    """What `top` shows, from one status to the next."""
+    """The lines that `top` shows, from one status to the next."""
 
     def __init__(self) -> None:
         self._factors: deque[float] = deque(maxlen=_HISTORY)

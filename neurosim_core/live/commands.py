@@ -139,7 +139,7 @@ class CommandSubscriber:
 
     @property
     def counts(self) -> CommandCounts:
-        """What happened since the last `reset`."""
+        """Counts since the last `reset`."""
         return CommandCounts(*(a - b for a, b in zip(self._totals(), self._before, strict=True)))
 
     def reset(self) -> None:

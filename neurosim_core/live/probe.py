@@ -34,7 +34,7 @@ class ProbeError(RuntimeError):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LoopTrace:
-    """What a controller saw that answers every image; times are of CLOCK_MONOTONIC."""
+    """Measurements of a controller that answers every image; times are of CLOCK_MONOTONIC."""
 
     sent_ns: NDArray[np.int64]
     """When each command was handed to Cortex [ns], shape [commands]."""
@@ -151,7 +151,7 @@ def _receive(subscriber: Subscriber[Any], check: Check, limit_s: float) -> tuple
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StreamTrace:
-    """What a `StreamProbe` has noted."""
+    """Measurements of a `StreamProbe`."""
 
     imu_stamp_ns: NDArray[np.int64]
     """Stamps of the samples [ns], shape [samples]."""

@@ -49,7 +49,7 @@ class RemoteRendererError(RuntimeError):
 
 @dataclass(frozen=True, kw_only=True)
 class Frames:
-    """What a renderer answers: frames of all poses that it was asked for, in their order."""
+    """The answer of a renderer: frames of all poses that it was asked for, in their order."""
 
     linear: NDArray[np.float32] | None = None
     """Linear radiance, red, green, blue (Rec. 709), shape [n, H, W, 3]."""

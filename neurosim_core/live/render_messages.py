@@ -13,7 +13,7 @@ class RenderRequest:
     """Poses of one camera, of which frames are wanted."""
 
     client: UInt64
-    """Who asks; the answer has the same."""
+    """Number of the client; the answer has the same."""
     number: UInt64
     """Which of its requests this is; likewise."""
     position: Annotated[Array["float64", "n", 3], Unit("m")]
@@ -33,7 +33,7 @@ class RenderRequest:
     cy: Annotated[float, Unit("px")]
     """Principal point [px]."""
     outputs: list[str]
-    """What is wanted: radiance, depth."""
+    """Requested outputs: radiance, depth."""
 
 
 @message(name="neurosim/RenderReply")
@@ -41,7 +41,7 @@ class RenderReply:
     """The frames of one request, in the order of its poses; what was not asked for has size 0."""
 
     client: UInt64
-    """Who asked."""
+    """Number of the client that asked."""
     number: UInt64
     """Which request this answers."""
     linear: Array["float32", "linear_n", "linear_height", "linear_width", 3]

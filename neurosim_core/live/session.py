@@ -35,7 +35,7 @@ _SETTLED_NS = 1_000_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions:
-    """What a viewer shows."""
+    """Options of a viewer."""
 
     only: Sequence[str] | None = None
     """Sensors to show; None: all."""

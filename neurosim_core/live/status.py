@@ -122,7 +122,7 @@ class SubscriberMonitor:
 
 
 class RunStats:
-    """What a run measures besides what its vehicles count, and the status that says it.
+    """Measurements of a run besides the counts of its vehicles, and the status made of them.
 
     Attributes:
         step_times: Time to compute a control period, since the last status [ns].

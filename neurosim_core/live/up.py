@@ -41,9 +41,9 @@ class Part:
     command: Sequence[str]
     """Program, by its path, and arguments."""
     at_its_end: Literal["end", "end if it failed", "go on"] = "end"
-    """What the others do when it ends by itself."""
+    """The response of the other processes when it ends by itself."""
     advice: str = ""
-    """What to tell a user when it has ended and the others go on."""
+    """The message to the user when it has ended and the others go on."""
     is_prefixed: bool = True
     """Whether its lines are printed behind its name."""
 

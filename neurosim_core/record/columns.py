@@ -42,9 +42,9 @@ class Column:
         self._dtype = np.dtype(object) if self._dataset.dtype.kind == "O" else np.dtype(dtype)
         self.deflates = compressed and self._dtype.kind != "O" and 0 not in shape
         self._rows: list[NDArray[Any]] = []
-        """What came since the last flush; if that deflates, what the last chunk holds so far."""
+        """Values since the last flush; if that deflates, the content of the last chunk so far."""
         self._begin = self._end = self._flushed_end = 0
-        """Where they begin and end, and where the last flush ended."""
+        """Their begin and end, and the end of the last flush."""
         self._deflated: list[Chunks] = []
         self._taken: tuple[list[NDArray[Any]], int, int, list[Chunks]] | None = None
         """Rows, begin, end and chunks for `write_rows`."""

@@ -64,7 +64,7 @@ class Disk:
             self._file = open(path, "w+b", buffering=0)  # noqa: SIM115 (closed by close())
         self._error: OSError | None = None
         self.taken_bytes = 0
-        """What the disk took so far [bytes]."""
+        """Size of the data that the disk has taken so far [bytes]."""
         self._is_ours = True
         self._offset = 0
         self._sealed_size = 0

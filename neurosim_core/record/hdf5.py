@@ -69,7 +69,7 @@ _QUIET_S = 5.0
 
 
 class _Flush(NamedTuple):
-    """What the thread that writes is to bring into the file."""
+    """The data that the writing thread puts into the file."""
 
     streams: list[Stream]
     newest_ns: int

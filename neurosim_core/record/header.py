@@ -61,7 +61,7 @@ class SensorDescription:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RecordingHeader:
-    """What is recorded of a flight besides its packets."""
+    """The data of a recording besides its packets."""
 
     config_yaml: str
     """The resolved configuration; `load_config` reads it back."""

@@ -48,7 +48,7 @@ class Stream:
         self._check_shapes(first.sensor, values)
         self._fixed = self._fixed_part(values)
         self._form: list[Any] | None = None
-        """What `_form_of` gives for packets that fit."""
+        """The result of `_form_of` for packets that fit."""
         group.attrs["packet"], group.attrs["schema"] = schema.name, schema.to_json()
         self._packet_count = group.create_dataset("packet_count", data=np.int64(0))
         self.is_events = all(self._varying.get(name) == "event" for name in DSEC_NAMES)

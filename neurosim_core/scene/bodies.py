@@ -213,7 +213,7 @@ def velocity_on_body(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BodyPoses:
-    """Where bodies are at K instants, on a device."""
+    """Poses of bodies at K instants, on a device."""
 
     p_WO: wp.array2d[wp.vec3d]
     """Positions [m], shape [K, B]."""

@@ -196,13 +196,13 @@ class FreeSpace:
     closed: bool
     """Outside there is nothing to fly in (`Scene.closed`), and no `seed_m` of the configuration says else."""
     notes: tuple[str, ...]
-    """What was assumed, one sentence each; shown to the user."""
+    """Assumptions, one sentence each; shown to the user."""
     arrays: DistanceField
     """The map on its device, for kernels."""
     mesh: wp.Mesh
     """Triangles on the device; kept alive with this."""
     device: str
-    """Where `arrays` and `mesh` are."""
+    """Device of `arrays` and `mesh`."""
 
     def clearance(self, points: ArrayLike) -> Array:
         """Return the exact distance [m] of points [n, 3] to the nearest triangle or bound; < 0 outside."""

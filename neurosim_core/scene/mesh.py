@@ -64,7 +64,7 @@ class MeshSceneConfig(SceneConfig):
     """Factor from candela in the file to radiance reflected at 1 m, refused where the file has no lights.
     None: such that rooms are well lit."""
     missing_texture: Literal["error", "ignore"] = "error"
-    """What to do when a texture file is not there: stop, or go on with the base colour alone."""
+    """The response to a missing texture file: stop, or go on with the base colour alone."""
     ambient_up: LinearRgb = (0.35, 0.35, 0.36)
     """Linear radiance that a white surface facing up reflects of the ambient light."""
     ambient_down: LinearRgb = (0.22, 0.21, 0.20)

@@ -61,7 +61,7 @@ class SceneReader:
         self.planner = planner
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  closed by `__exit__`
         self._places: list[Future[list[tuple[int, int]]]] = [Future() for _ in range(4)]
-        """Where the parts of each answer are in the file, and how long they are."""
+        """Offset and length in the file of the parts of each answer."""
         self._answers: dict[int, Any] = {}
         self._unpacking = threading.Lock()
         read = {key: settings.get(key, {}) for key in ("scene", "render")}

@@ -167,9 +167,9 @@ class Scene:
     sky: LinearRgb = (0.55, 0.7, 0.95)
     """Radiance of rays that hit nothing."""
     notes: tuple[str, ...] = ()
-    """What was assumed, dropped or repaired while loading, one sentence each; shown to the user."""
+    """Assumptions, losses and repairs of loading, one sentence each; shown to the user."""
     instance_labels: Mapping[str, str] = field(default_factory=dict)
-    """What instances are, such as "chair", by name, where the file says it."""
+    """Classes of instances, such as "chair", by name, where the file says them."""
     inside_m: tuple[float, float, float] | None = None
     """A point known to be in free space, if the source of the scene knows one [m]."""
     closed: bool = False
@@ -191,7 +191,7 @@ class Scene:
 
     @cached_property
     def connections(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """What `connect_faces` returns."""
+        """The result of `connect_faces`."""
         return connect_faces(self) if self.connect is None else self.connect()
 
     @cached_property

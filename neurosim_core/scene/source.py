@@ -64,16 +64,16 @@ class Source:
     materials: list[Material] = field(default_factory=list)
     instance_names: list[str] = field(default_factory=list)
     instance_labels: dict[str, str] = field(default_factory=dict)
-    """What instances are, by name, as far as the file says it."""
+    """Classes of instances, by name, as far as the file says them."""
     lamps: list[Lamp] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     unit_m: float = 1.0
     """Metres per file unit."""
     unit_reason: str = ""
     up_axis: Axis | None = None
-    """What the file itself says about up; None: nothing."""
+    """The up axis that the file itself states; None: it states none."""
     up_default: Axis = "z"
-    """What the format means where neither the file says more nor a building is seen in it."""
+    """The up axis of the format, where neither the file states one nor a building shows it."""
     up_reason: str = ""
     """Why `up_axis` is believed, or what `up_default` rests on."""
 

@@ -27,7 +27,7 @@ _PARTS = 16
 
 
 class FlightLimits(Settings):
-    """What a path may ask of the vehicle; holds everywhere on the path."""
+    """Limits of what a path asks of the vehicle; they hold everywhere on the path."""
 
     speed_max_m_s: float = Field(default=3.0, gt=0.0, le=200.0)
     """Largest speed [m/s]."""

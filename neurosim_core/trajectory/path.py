@@ -36,7 +36,7 @@ class PathArrays:
 
 @wp.struct
 class PathPoint:
-    """What a path asks for at one instant, in the world frame."""
+    """The setpoint of a path at one instant, in the world frame."""
 
     position: wp.vec3d
     """[m]."""
@@ -58,7 +58,7 @@ class PathPoint:
 
 @wp.struct
 class PathPlace:
-    """Where on a path an instant is."""
+    """The position of an instant on a path."""
 
     knot: int
     """At which its piece begins."""
@@ -226,7 +226,7 @@ class Path:
 
     @property
     def durations_s(self) -> NDArray[np.float64]:
-        """How long each piece takes [s], shape [S]."""
+        """Durations of the pieces [s], shape [S]."""
         return np.diff(self.knots_ns) / NS_PER_S
 
     @property

@@ -57,7 +57,7 @@ class PlanningError(ValueError):
 
 
 class CollisionFreeConfig(Settings):
-    """What every planned path has."""
+    """Settings that all planned paths have."""
 
     clearance_m: float = Field(default=0.3, gt=0.0)
     """Distance from the path to the scene [m]: more than the vehicle's collision radius; holds everywhere."""

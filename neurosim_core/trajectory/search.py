@@ -131,7 +131,7 @@ def _search(
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What a search from one voxel has found."""
+    """The result of a search from one voxel."""
 
     cost: NDArray[np.float32]
     """Length of the best way, weighted by slowness [m], shape [nx, ny, nz]; inf where none was found."""

@@ -37,7 +37,7 @@ _RAMP = Polynomial([0.0] * 5 + [126.0, -420.0, 540.0, -315.0, 70.0])
 
 
 class ShapeConfig(Settings):
-    """What every closed-form path has."""
+    """Settings that all closed-form paths have."""
 
     yaw: Literal["travel"] | float = 0.0
     """Heading [rad], or travel: look where it flies."""
@@ -72,7 +72,7 @@ class LineConfig(ShapeConfig):
 
 
 class PeriodicConfig(ShapeConfig):
-    """What every closed curve has."""
+    """Settings that all closed curves have."""
 
     center_m: Vector3 | None = None
     """Centre of the curve [m]; null: the middle of free space."""

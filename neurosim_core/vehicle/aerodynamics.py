@@ -54,7 +54,7 @@ class Airframe:
 
 @wp.struct
 class Rotors:
-    """What each rotor weighs in the sums over the rotors, [R]."""
+    """Weight of each rotor in the sums over the rotors, [R]."""
 
     quadratic_weight: wp.array[wp.vec4d]  # see `quadratic_weights`
     linear_weight: wp.array[vec10d]  # see `linear_weights`

@@ -26,7 +26,7 @@ multiprocessor, and the block of a single one fits beside those of a renderer.""
 
 @wp.struct
 class MultirotorArrays:
-    """What lives on the device of a batch. Write `rotor_speed_command`; the rest is read-only."""
+    """The device arrays of a batch. Write `rotor_speed_command`; the rest is read-only."""
 
     position: wp.array[wp.vec3d]
     """p_WB [m], [N]."""

@@ -25,12 +25,12 @@ from neurosim_core.vehicle.arrays import (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VehicleContext:
-    """What a vehicle is made for."""
+    """The context that a vehicle is made in."""
 
     count: int
-    """How many worlds there are, each with one."""
+    """Number of worlds, each with one vehicle."""
     device: str
-    """Where its state has to be."""
+    """Device of its state."""
     max_step_ns: int
     """Longest integration step [ns]."""
     seeds: Any
@@ -53,7 +53,7 @@ class VehicleConfig(Settings):
 
     @property
     def title(self) -> str:
-        """What to call it where people read."""
+        """Name for texts that people read."""
         return self.kind
 
     def airframe(self) -> MultirotorConfig:
@@ -73,13 +73,13 @@ class Vehicle(Protocol):
     count: int
     """Number of worlds, N."""
     device: Any
-    """Where `arrays` are."""
+    """Device of `arrays`."""
     max_step_ns: int
     """Longest integration step [ns]."""
     arrays: MultirotorArrays
     """The state; `rotor_speed_command` is written by others."""
     terms: tuple[str, ...]
-    """What was compiled in."""
+    """Optional terms that are compiled in."""
 
     def advance(self, duration_ns: int) -> None:
         """Move all vehicles on by a duration [ns] under the commands that hold."""

@@ -31,7 +31,7 @@ class RotorSums:
 
 @wp.struct
 class Interval:
-    """What vehicles are moved by."""
+    """A stretch of time that vehicles are integrated over, with the settings of the integrator."""
 
     duration_ns: wp.int64
     max_step_ns: wp.int64

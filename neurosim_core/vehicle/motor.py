@@ -20,7 +20,7 @@ _RATE_MAX_1_S = 1e300  # so that rate t is 0 at t = 0 also for tau = 0
 
 
 class LagConstants(NamedTuple):
-    """What a step of given length needs to know of the lag."""
+    """Coefficients of the lag for a step of given length."""
 
     speed_nodes: tuple[float, float, float]
     """exp(-z s) projected on quadratics, at s = 0, 1/2, 1: weights of Omega_0 - c in Omega."""

@@ -39,7 +39,7 @@ _INTERVAL_COUNT_MAX = 256  # that are kept, one for each duration
 
 
 class Effort(NamedTuple):
-    """What the adaptive integrator did for each vehicle since the reset, on the host."""
+    """Counts of the adaptive integrator for each vehicle since the reset, on the host."""
 
     redone_count: NDArray[np.int64]
     """Intervals that fixed steps could not resolve and that were redone, [N]."""
@@ -297,7 +297,7 @@ class Multirotor:
 
     @property
     def effort(self) -> Effort:
-        """What adaptive steps were needed for since the reset, on the host; waits for the device."""
+        """Counts of adaptive steps since the reset, on the host; waits for the device."""
         a = self.arrays
         return Effort(np.array(a.redone_count.numpy()), np.array(a.evaluation_count.numpy()))
 

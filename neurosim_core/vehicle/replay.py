@@ -57,7 +57,7 @@ _APART = 300  # samples around what is no flight that are left out
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FlightLog:
-    """What a Crazyflie measured, at 1 kHz, with the commands that it gave to its motors."""
+    """The measurements of a Crazyflie at 1 kHz, with the commands that it gave to its motors."""
 
     specific_force: Array
     """Accelerometer in B, without its offset at rest [m/s^2], shape [n, 3]."""
@@ -69,7 +69,7 @@ class FlightLog:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Replay:
-    """How far a replay is from its log, over all windows."""
+    """The distance of a replay from its log, over all windows."""
 
     window_count: int
     rate_rms_rad_s: Array
@@ -247,7 +247,7 @@ def _specific_force(vehicle: Multirotor) -> Array:
 
 
 class _Calibration(NamedTuple):
-    """What makes the model agree, in the mean, with the flight before each window."""
+    """The corrections that make the model agree, in the mean, with the flight before each window."""
 
     scale: Array
     """Factor of the thrust for a command, shape [N]."""

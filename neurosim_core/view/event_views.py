@@ -35,7 +35,7 @@ brighter, older first."""
 
 
 class EventViews:
-    """What is shown of one event camera: its windows, the last event of each pixel, and the last windows."""
+    """The views of one event camera: its windows, the last event of each pixel, and the last windows."""
 
     def __init__(self, *, width: int, height: int, window_ns: int, compress: bool) -> None:
         self._size = {"width": width, "height": height}

@@ -25,7 +25,7 @@ _STEP_PX = 4
 
 
 class Snapshot(NamedTuple):
-    """What the sensors of a vehicle saw at one moment."""
+    """The pictures of a vehicle's sensors at one moment."""
 
     stamp_ns: int
     """The moment [ns]."""
@@ -35,7 +35,7 @@ class Snapshot(NamedTuple):
 
 
 class Track(NamedTuple):
-    """Where the vehicle was, by time."""
+    """Positions of the vehicle, by time."""
 
     stamp_ns: NDArray[np.int64]
     """Times [ns], shape [n]."""

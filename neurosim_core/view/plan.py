@@ -20,7 +20,7 @@ class Plan:
     """A scene cut at a height. Coordinates are those of the world."""
 
     outlines: NDArray[np.float64]
-    """Where the plane cuts surfaces [m], shape [n, 2, 2]: segments of two points (x, y)."""
+    """Cuts of the plane through surfaces [m], shape [n, 2, 2]: segments of two points (x, y)."""
     low_outlines: NDArray[np.float64]
     """The same, cut at 0.3 of the height above the lowest point of the scene: tables, beds, sofas."""
     triangles: NDArray[np.float64]

@@ -114,7 +114,7 @@ class SceneShapes:
     bounds_m: NDArray[np.float64]
     """Lowest and highest corner of all vertices [m], shape [2, 3]."""
     bodies: dict[str, BodyConfig] = field(default_factory=dict)
-    """What moves, by name: its meshes are below `world/bodies/<name>`."""
+    """Moving bodies, by name: their meshes are below `world/bodies/<name>`."""
 
 
 def scene_shapes(scene: Scene, bodies: Sequence[Body] = ()) -> SceneShapes:

@@ -67,7 +67,7 @@ class RerunViewer:
         else:
             options += ["--memory-limit", _WINDOW_MEMORY, "--hide-welcome-screen", "--expect-data-soon"]
         self.data_url = f"rerun+http://{HOST}:{data_port}/proxy"
-        """Where recordings are sent to."""
+        """Address of the viewer for recordings."""
         self.page_url = ""
         """Address of the page; empty for a window."""
         if web:

@@ -25,7 +25,7 @@ Place = Literal["anywhere", "corner", "middle"]
 
 
 class RoomSpace:
-    """What is still free in one room; pieces that fit are kept where they stand.
+    """The free floor of one room; pieces that fit are kept where they stand.
 
     Boxes are lowest and highest corners in the world [m], shape [N, 2, 3].
     """

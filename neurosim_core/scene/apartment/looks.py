@@ -37,7 +37,7 @@ class Surface:
 
 
 class Finish(NamedTuple):
-    """What a room is lined with."""
+    """The materials of a room's walls, floor and ceiling."""
 
     floor: Surface
     walls: tuple[Surface, ...]

@@ -209,7 +209,7 @@ def screen(rng: np.random.Generator) -> Picture:
 
 
 def view(rng: np.random.Generator) -> Picture:
-    """What is outside: sky with clouds, a hazy town, trees; row 0 is the top."""
+    """Return a picture of the outside: sky with clouds, a hazy town, trees; row 0 is the top."""
     x, y = texel_grid(512, 512)
     picture = blend("#8db9e8", "#e9f1f7", y * 1.5)
     cloud = noise(rng, 1.75, stretch=2.2)
