@@ -28,7 +28,7 @@ class BodyArrays:
     bodies: tuple[Body, ...]
     meshes: tuple[wp.Mesh, ...]
     shading: wp.Mesh | None
-    """What of the scene casts shadows on bodies."""
+    """The part of the scene that casts shadows on bodies."""
     data: BodyData
     """Without the arrays of instants."""
 

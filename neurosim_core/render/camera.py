@@ -1,4 +1,4 @@
-"""What a lens is to a renderer, and the pinhole; the other lenses are in `lenses.py`.
+"""The interface of a lens to a renderer, and the pinhole; the other lenses are in `lenses.py`.
 
 A renderer knows nothing of a lens but its table of rays, so that any lens can be used.
 """
@@ -16,7 +16,7 @@ from neurosim_core.settings import Settings
 
 
 class Lens(Protocol):
-    """What a renderer asks of a lens; equal ones have the same rays, which are kept."""
+    """The interface of a lens to a renderer; equal lenses have the same rays, which are kept."""
 
     def __hash__(self) -> int: ...
 

@@ -1,4 +1,4 @@
-"""What kernels are made for, and what they read and write: terms and structures.
+"""The data of render kernels: the terms that they are compiled for, and structures that they read and write.
 
 Scenes, bodies, the camera of a launch with its worlds and candidate lists, hits, and outputs.
 """

@@ -37,7 +37,7 @@ _TABLE_SIZE = 4096
 
 
 class _Lens(Settings):
-    """What all lenses but the pinhole have in common."""
+    """The base class of all lenses but the pinhole."""
 
     width: int = Field(gt=0, le=16384)
     """Width of the picture [px]."""
@@ -275,7 +275,7 @@ class DoubleSphereConfig(_WideLens):
     xi: float = Field(gt=-1.0, lt=1.0)
     """Distance between the centres of the two spheres."""
     alpha: float = Field(ge=0.0, le=1.0)
-    """Where the pinhole is: a / (1 - a) behind the centre of the second sphere."""
+    """Position of the pinhole: a / (1 - a) behind the centre of the second sphere."""
 
     @property
     def distortion_coefficients(self) -> tuple[float, ...]:

@@ -31,7 +31,7 @@ FACE = "face"
 
 
 class RequestedOutputs(NamedTuple):
-    """What a set of outputs requires."""
+    """The requirements of a set of outputs."""
 
     log: bool
     """Log radiance, which all instants have, is requested."""

@@ -1,6 +1,6 @@
 # mypy: disable-error-code="index,attr-defined,operator,arg-type,no-untyped-def,call-overload,return-value"
 # mypy: disable-error-code="assignment,valid-type"
-"""Where points are in the picture of a lens, on the device: the models of `lenses.py`."""
+"""Projection of points into the picture of a lens, on the device: the models of `lenses.py`."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of functions in closures as objects.
 

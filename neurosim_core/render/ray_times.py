@@ -41,7 +41,7 @@ class RayTiming(Protocol):
 
     @property
     def window_ns(self) -> int:
-        """How long before the stamp the first ray is cast [ns]."""
+        """Time from the first ray to the stamp [ns]."""
 
     def times(self, lens: Lens, sample_count: int) -> RayTimes | None:
         """Return the times of the rays of a lens, of so many samples; None: all are cast at the stamp."""
@@ -92,7 +92,7 @@ class ShutterConfig(Settings):
 
     @property
     def window_ns(self) -> int:
-        """How long before the stamp the first ray is cast [ns]."""
+        """Time from the first ray to the stamp [ns]."""
         return math.ceil((self.readout_s + self.exposure_s) * NS_PER_S)
 
     def times(self, lens: Lens, sample_count: int) -> RayTimes | None:

@@ -1,4 +1,4 @@
-"""What a renderer is, and which one renders."""
+"""The interface of renderers, and the choice of one."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class SceneArrays:
     embree: EmbreeTree | None
     """The triangles of `mesh`, if Embree finds what the rays of cameras hit."""
     bodies: BodyArrays | None
-    """What moves in the scene; None: nothing does."""
+    """Moving bodies; None: there are none."""
     instance_names: tuple[str, ...]
     """Names of the instances: those of the scene, then of the bodies."""
     terms: RenderTerms

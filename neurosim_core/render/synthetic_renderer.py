@@ -45,7 +45,7 @@ _POSE_IN_DEPTH_PX = wp.constant(7)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SyntheticScene:
-    """What all test cards of a run share."""
+    """The data that all test cards of a run share."""
 
     scene: Scene
     config: RenderConfig

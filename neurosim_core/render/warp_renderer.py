@@ -48,7 +48,7 @@ class RenderWorlds:
     scene_of_world: Any = None
     """Index into `scenes` of each world, device array of int32, shape [N]."""
     terms: RenderTerms | None = None
-    """What some scene needs in the kernel; None: as the scene of the renderer says."""
+    """Terms of the kernel that some scene needs; None: as the scene of the renderer says."""
 
 
 def ray_times_of(timing: RayTiming | None, lens: Lens, arrays: SceneArrays) -> RayTimes | None:

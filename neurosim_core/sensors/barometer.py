@@ -24,7 +24,7 @@ _TROPOPAUSE_M = wp.constant(wp.float64(11_000.0))
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pressure(Packet):
-    """What a barometer reads."""
+    """The reading of a barometer."""
 
     pressure_pa: Annotated[float, FieldSpec(unit="Pa")]
     """Static pressure [Pa]."""

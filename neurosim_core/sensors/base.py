@@ -1,4 +1,4 @@
-"""What a sensor is to the engine: a sensor is one file that registers one subclass of these classes.
+"""The interface of sensors: a sensor is one file that registers one subclass of these classes.
 
 A *state sensor* (IMU, odometry) reads the state of the vehicles at its stamps: its config makes a `Sampler`.
 An *image sensor* (RGB, depth) takes a picture that the renderer has computed: its config names the output of
@@ -31,12 +31,12 @@ RateHz = Annotated[float, Field(gt=0.0, le=1e6)]
 
 
 class RenderRequest(NamedTuple):
-    """What a camera asks of the renderer."""
+    """The request of a camera to the renderer."""
 
     outputs: frozenset[str]
     """Some of `render.outputs.OUTPUTS`."""
     rate_hz: float
-    """How often [Hz]."""
+    """Frequency [Hz]."""
     every_instant: bool = False
     """It has to see all instants that are rendered in its group, in order; its rate is that of the group."""
     max_displacement_px: float | None = None
@@ -90,20 +90,20 @@ class SensorConfig(Settings):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SamplerContext:
-    """What a state sensor is made for."""
+    """The context that a state sensor is made in."""
 
     name: str
     """Its name in the settings; two sensors with different names have independent noise."""
     vehicle: Multirotor
     """The vehicles of all worlds."""
     slot_count: int
-    """How many samples its arrays hold."""
+    """Number of samples that its arrays hold."""
     seeds: Any
     """Seed of each world, device array of uint64, shape [world]."""
     active: Any
     """0 where a world is not measured, device array of int32, shape [world]."""
     surfaces: Any = None
-    """What vehicles can touch (`sim.trace.Surfaces`)."""
+    """The surfaces that vehicles can touch (`sim.trace.Surfaces`)."""
 
 
 class Sampler(ABC):
@@ -176,7 +176,7 @@ class RenderedConfig(SensorConfig):
 
     @property
     def look_back_ns(self) -> int:
-        """How long before the end of a batch it needs the motion of the vehicle [ns]."""
+        """Time before the end of a batch for which it needs the motion of the vehicle [ns]."""
         return 0
 
     def render_request(self) -> RenderRequest:
@@ -185,7 +185,7 @@ class RenderedConfig(SensorConfig):
 
 
 class CameraConfig(RenderedConfig):
-    """What every camera has: a lens and a place on the body."""
+    """Settings that all cameras have: a lens and a place on the body."""
 
     lens: AnyLens = PinholeConfig(width=346, height=260, horizontal_fov_rad=1.5)
     """Resolution and field of view: {kind: pinhole | radtan | rational | equidistant | double_sphere |
@@ -222,12 +222,12 @@ def expand_stereo(sensors: Mapping[str, SensorConfig]) -> dict[str, SensorConfig
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PictureContext:
-    """What the processing of the pictures of one sensor is made for."""
+    """The context that the processing of the pictures of one sensor is made in."""
 
     name: str
     """Its name in the settings; two sensors with different names have independent noise."""
     source: Any
-    """What the renderer writes, device array, shape [M, H, W, ...]; M image slots."""
+    """Pictures that the renderer writes, device array, shape [M, H, W, ...]; M image slots."""
     sources: Mapping[str, Any]
     """The same for all outputs that the sensor asks for, by name."""
     lenses: Sequence[Lens]
@@ -252,9 +252,9 @@ class PictureViews(NamedTuple):
     """From where and when the pictures of a batch were taken; device arrays, rows are [world, K] in order."""
 
     instant_count: int
-    """How many of the K instants of each world were rendered."""
+    """Number of the K instants of each world that were rendered."""
     image_slot: Any
-    """Where the picture of an instant is, int32, shape [N K]; -1: there is none."""
+    """Slot of the picture of an instant, int32, shape [N K]; -1: there is none."""
     p_WC: Any
     """Position of the camera [m], vec3, shape [N K J], for the J times of its rays (1: the stamp)."""
     q_WC: Any
@@ -264,7 +264,7 @@ class PictureViews(NamedTuple):
     active: Any
     """0 where a world is not rendered, int32, shape [N]; None: all are."""
     bodies: Any
-    """Where bodies are at these times, `scene.bodies.BodyPoses`; None: there are none."""
+    """Poses of bodies at these times, `scene.bodies.BodyPoses`; None: there are none."""
     look: Callable[..., None]
     """Writes these poses at other times: of the offsets from the stamp [ns], int64, shape [J], not before
     `RenderedConfig.look_back_ns`; `p_WC`, `q_WC`, `stamps` and `bodies` are overwritten."""
@@ -274,15 +274,15 @@ class PictureViews(NamedTuple):
 
 
 class PictureProcess(Protocol):
-    """What makes of the pictures that are rendered those that a sensor takes: noise, and the like.
+    """Turns the rendered pictures into those of the sensor: adds noise, for example.
 
     Its pictures are those of an output that has image slots. What it draws is addressed by the stamp.
     """
 
     terms: tuple[str, ...]
-    """What it computes."""
+    """Optional terms that it computes."""
     picture: Any
-    """What it makes, device array, shape [M, H, W, ...]."""
+    """Pictures that it makes, device array, shape [M, H, W, ...]."""
 
     def launch(self, views: PictureViews) -> None:
         """Process the pictures of a batch that was just rendered; launches only."""
@@ -295,7 +295,7 @@ class PictureSensorConfig(RenderedConfig):
     """Pictures a second [Hz]."""
 
     output: ClassVar[str]
-    """What it takes pictures of, one of `render.outputs.OUTPUTS`."""
+    """The rendered quantity, one of `render.outputs.OUTPUTS`."""
 
     @property
     def outputs(self) -> frozenset[str]:
@@ -339,7 +339,7 @@ class ImageSensorConfig(CameraConfig, PictureSensorConfig):
 
     packet_type: ClassVar[type[Packet]] = Image
     encoding: ClassVar[ImageEncoding]
-    """What a pixel of its pictures is."""
+    """Encoding of a pixel of its pictures."""
 
     @model_validator(mode="after")
     def _pictures_do_not_overlap(self) -> ImageSensorConfig:
@@ -393,7 +393,7 @@ class FrameSensor(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FrameContext:
-    """What a frame sensor is made for."""
+    """The context that a frame sensor is made in."""
 
     name: str
     device: str
@@ -425,7 +425,7 @@ class WorldFrameSensor(Protocol):
 
     @property
     def results(self) -> Any:
-        """What it found in the last step, on the device."""
+        """The results of the last step, on the device."""
 
     def begin(self, mask: Any, parity: int) -> None:
         """Let worlds whose mask (int32, [N]) is not 0 take frame 0 as their reference; launches only."""
@@ -453,7 +453,7 @@ class WorldFrameSensor(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WorldFrameContext:
-    """What a frame sensor of many worlds is made for."""
+    """The context that a frame sensor of many worlds is made in."""
 
     name: str
     configs: Sequence[Any]

@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Contact(Packet):
-    """What a contact switch says."""
+    """The state of a contact switch."""
 
     closed: bool
     """It touches something."""

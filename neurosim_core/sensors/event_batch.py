@@ -58,7 +58,7 @@ class FrameEvents:
 
     @property
     def offsets(self) -> NDArray[np.int32]:
-        """Where the events of each camera begin, and the end, shape [N + 1]."""
+        """Offset of the first event of each camera, and the end, shape [N + 1]."""
         return np.fromiter(itertools.accumulate(self.counts, initial=0), np.int32, len(self.counts) + 1)
 
     @property
@@ -152,7 +152,7 @@ class EventCameraBatch:
         self._stamp_ns: int | None = None
         self._epoch_us = 0
         self._origin_us = 0
-        """Where the device believes the present frame to begin: time goes on, and it is told of changes."""
+        """Begin of the current frame as the device has it; it advances by itself, and changes are sent."""
         self.frame_number = 0
         """Of the last frame, so that nobody reads the events of another."""
 

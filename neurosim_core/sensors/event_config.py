@@ -1,4 +1,4 @@
-"""What decides the events of a camera: thresholds, and how its pixels and its readout depart from the ideal.
+"""Settings of an event camera: thresholds, and how its pixels and its readout depart from the ideal.
 
 Every group is optional. What is left out is not compiled and allocates nothing; the kernels are in
 `event_scan` (ideal pixels), `event_noise_scan` and `event_readout`.

@@ -1,4 +1,4 @@
-"""What an event camera is given: frames and stamps, as it takes them, or why it does not."""
+"""The input of an event camera: frames and stamps, converted, or an error that says why they are refused."""
 
 from __future__ import annotations
 

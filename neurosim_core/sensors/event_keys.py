@@ -102,7 +102,7 @@ class EventKeys:
         self._rooms: dict[int, wp.array[wp.int64]] = {}
         """Of both buffers, by address, what keys may be in."""
         self._blocks = BufferPool(device) if on_host and device.is_cuda else None
-        """Where events go that are copied to the host."""
+        """Host memory for events."""
         self._columns: list[Any] = []
         """What is copied to them: one block of memory, as each type that is in it."""
         self._read = Fence(device)

@@ -27,7 +27,7 @@ _ZERO = wp.constant(wp.float64(0.0))
 
 @wp.struct
 class _Spread:
-    """How what stays in pixels differs from pixel to pixel, times in ns."""
+    """The spread from pixel to pixel of constant parameters, times in ns."""
 
     seed: wp.uint64
     threshold_stream: wp.uint32

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="misc,attr-defined"
-"""What is not ideal in event pixels: the law of each term, its parameters, and the base of its settings.
+"""Noise of event pixels: the law of each term, its parameters, and the base of its settings.
 
 **Photoreceptor** (term low_pass). tau(I) dy/dt = L - y, solved exactly for log radiance L that is linear in
 time and tau that is constant; an interval is cut where L moves by more than 1/8, and tau is taken in the

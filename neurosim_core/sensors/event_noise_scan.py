@@ -1,6 +1,6 @@
 # mypy: disable-error-code="index,arg-type,operator,call-overload,assignment,no-untyped-def,return-value"
 # mypy: disable-error-code="attr-defined,misc"
-"""The scan of an event pixel that is not ideal, made to measure: only the terms that are asked for.
+"""The scan of an event pixel with noise; a kernel has only the terms that the settings switch on.
 
 The signal of a pixel, its log radiance through the photoreceptor plus what its reference has leaked, is known
 in closed form between frames. Events are taken one after the other, at the time at which the signal reaches a

@@ -248,7 +248,7 @@ class Scan:
     number: int
     """Its own for ever: a graph may be made of its buffers."""
     stack: Any
-    """What its kernels see, a `Stack`."""
+    """The input of its kernels, a `Stack`."""
     done: Fence
     inputs: HostInput
     counters_on_host: HostCopy
@@ -260,7 +260,7 @@ class Scan:
     """Of the inputs: time from the reset to the origin [ns]; then stamps of the state and of each frame, from
     the origin [ns]."""
     first_key: int = 0
-    """Where its keys begin: there are others before."""
+    """Offset of its keys, behind those of others."""
     frames: Any = None
     """Shape [frame, row, column]; None: those of the last stack have been given back."""
     stamps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))

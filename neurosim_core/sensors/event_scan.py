@@ -92,7 +92,7 @@ class PixelState:
 
 @wp.struct
 class Extent:
-    """What a launch scans, and what for."""
+    """The input of a launch of the scan, and its purpose."""
 
     first_world: wp.int32
     world_count: wp.int32

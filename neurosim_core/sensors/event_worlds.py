@@ -43,7 +43,7 @@ class WorldEvents:
     polarity: wp.array[wp.uint8]
     """1: brighter, 0: darker, shape [room]."""
     offsets: wp.array[wp.int32]
-    """Where each world begins, and the end, shape [N + 1]."""
+    """Offset of the first event of each world, and the end, shape [N + 1]."""
     counts: wp.array[wp.int32]
     """Events of each world, shape [N]."""
     dropped: wp.array[wp.int32]
@@ -116,12 +116,12 @@ class WorldEventCamera:
             terms=terms,
         )
         self.terms: tuple[str, ...] = terms
-        """What is computed beyond ideal pixels in some world: some of `event_noise_model.TERMS`."""
+        """Terms beyond ideal pixels that some world needs: some of `event_noise_model.TERMS`."""
         self.seed = self._states.seed
         self.layout = self._states.layout
         self._shape = (world_count, pixel_count)
         self.stack = make_stack(world_count, frame_count, height, self.device)
-        """What a step sees and what comes of it, `event_kernels.Stack`."""
+        """The input and the output of a step, `event_kernels.Stack`."""
         self.stack.log_radiance = frames
         self.grow(capacity)
         self._sections = self._zeros(-(-world_count // int(event_kernels.SECTION)), wp.int64)

@@ -175,7 +175,7 @@ class EventCamera:
 
     @property
     def span_max_ns(self) -> int:
-        """How far frames may lie after the end of the last window [ns]; less with more pixels."""
+        """Longest time of frames after the end of the last window [ns]; less with more pixels."""
         return NS_PER_US << (63 - self._time_shift)
 
     @property
@@ -441,7 +441,7 @@ class EventCamera:
         return [end - scan.first_key for end, _, _ in counters]
 
     def _limit_rows(self, scan: Scan) -> bool:
-        """Where a frame has too many events, keep the rows from the top that fit; return whether one has."""
+        """Keep the rows from the top that fit, in frames with too many events; return whether one has."""
         lost = self._pixels.limit_rows(scan, self.config.event_count_max)
         short = np.flatnonzero(lost)
         if len(short) == 0:

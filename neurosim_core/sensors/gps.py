@@ -36,7 +36,7 @@ _ECCENTRICITY_2 = _FLATTENING * (2.0 - _FLATTENING)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GpsFix(Packet):
-    """What a GPS receiver says; it was there `delay_s` before the stamp."""
+    """The fix of a GPS receiver; it was there `delay_s` before the stamp."""
 
     latitude_rad: Annotated[float, FieldSpec(unit="rad")]
     """Geodetic, WGS84 [rad]."""

@@ -27,7 +27,7 @@ class LabelImage(Packet):
     """What labels mean, as JSON: {"instances": [[name, class], ...], "classes": [name, ...]}. The data are
     indices into the first list, or into the second one."""
     encoding: Annotated[str, FieldSpec(constant=True)] = "32SC1"
-    """What a pixel is, named as in ROS."""
+    """Encoding of a pixel, named as in ROS."""
 
 
 @register("sensor", "instance")

@@ -1,4 +1,4 @@
-"""How a LiDAR scans: which way each ray of a sweep goes, and when it is cast.
+"""Scan patterns of LiDARs: the direction and the time of each ray of a sweep.
 
 A scan is to the renderer what a lens is: a table of rays. Its rows are rings, its columns follow each other
 in time. Directions are azimuth and elevation in the sensor's frame S (x forward, y left, z up): azimuth from
@@ -24,7 +24,7 @@ DivergenceRad = Annotated[float, Field(gt=0.0, le=0.1)]
 
 
 class Scan(Settings):
-    """What every scan has."""
+    """Settings that all scans have."""
 
     divergence_rad: DivergenceRad = 0.003
     """Angle of the beam [rad]: textures are filtered over its footprint. The range is that of its axis."""

@@ -23,7 +23,7 @@ from neurosim_core.sensors.state_sampler import ErrorConfig, Motion, StateSample
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MagneticField(Packet):
-    """What a magnetometer reads, in its own frame S."""
+    """The reading of a magnetometer, in its own frame S."""
 
     field: Annotated[NDArray[np.float64], FieldSpec(3, unit="T", frame="sensor")]
     """Flux density [T], shape [3]."""

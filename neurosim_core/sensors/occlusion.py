@@ -1,6 +1,6 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,operator,assignment,arg-type,valid-type"
 # mypy: disable-error-code="no-untyped-def"
-"""What hides a point from a camera, told by a ray, or by the picture of the same camera at another time.
+"""Occlusion of points from a camera, found by a ray, or by the picture of the same camera at another time.
 
 Nothing is on the way from the other camera to a point where the picture shows only what is further than that
 way, and near the camera where no surface is as near. The least range around a pixel tells most of it at once.
@@ -36,7 +36,7 @@ _WAY_PX = wp.constant(64.0)
 
 @wp.struct
 class Surroundings:
-    """What is around cameras, and the lenses through which they see it."""
+    """The surroundings of cameras, and the lenses of the cameras."""
 
     lenses: wp.array[LensData]
     mesh: wp.array[wp.uint64]  # Of each scene

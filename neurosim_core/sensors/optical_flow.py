@@ -65,7 +65,7 @@ class OpticalFlow(Packet):
     to_ns: int
     """The other time [ns]; of a velocity the same."""
     encoding: Annotated[str, FieldSpec(constant=True)] = "32FC2"
-    """What a pixel of `data` is, named as in ROS."""
+    """Encoding of a pixel of `data`, named as in ROS."""
 
 
 @register("sensor", "optical_flow")

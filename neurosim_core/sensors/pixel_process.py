@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,call-overload,valid-type"
-"""What the processing of pictures shares: where a thread works, the poses of a batch, and one launch."""
+"""Shared by the processing of pictures: the pixel of a thread, the poses of a batch, and one launch."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of structures and functions as objects.
 
@@ -44,7 +44,7 @@ class Batch:
 
 @wp.struct
 class Element:
-    """Where in the pictures of a batch a thread works."""
+    """The pixel of a batch that a thread works on."""
 
     slot: int  # Of the picture; -1: there is none
     world: int

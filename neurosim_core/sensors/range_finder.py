@@ -18,7 +18,7 @@ from neurosim_core.sensors.base import ImageSensorConfig, RateHz
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Range(Packet):
-    """What a range finder reads at its stamp."""
+    """The reading of a range finder at its stamp."""
 
     display: ClassVar[str] = "time series"
 

@@ -1,4 +1,4 @@
-"""How cameras share the work of rendering: one ray answers all that share pose, lens, shutter and clock."""
+"""Cameras that share the work of rendering: one ray answers all that share pose, lens, shutter and clock."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class RenderGroup:
     image_sensors: tuple[str, ...]
     """Names of the cameras that take a picture at every n-th instant."""
     outputs: frozenset[str]
-    """What a ray answers."""
+    """The quantities that a ray finds."""
     timing: RayTiming | None = None
     """When rays are cast; None: all at the stamp."""
     look_back_ns: int = 0
-    """How long before the end of a batch a camera needs poses besides those of its rays [ns]."""
+    """Time before the end of a batch for which a camera needs poses besides those of its rays [ns]."""
     max_displacement_px: float | None = None
     """Rays are cast only at the instants that this asks for (`sensors.displacement`); None: at all."""
 
@@ -40,7 +40,7 @@ class RenderGroup:
 
     @property
     def window_ns(self) -> int:
-        """How long before a stamp poses are needed [ns]."""
+        """Time before a stamp for which poses are needed [ns]."""
         return max(self.look_back_ns, 0 if self.timing is None else self.timing.window_ns)
 
 

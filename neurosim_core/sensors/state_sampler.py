@@ -1,6 +1,6 @@
 # mypy: disable-error-code="index,attr-defined,misc,operator,arg-type,valid-type,assignment,call-overload"
 # mypy: disable-error-code="no-untyped-def"
-"""What small sensors share: errors of a measurement, delays, dropouts, and a sampler of one kernel.
+"""Shared by small sensors: errors of a measurement, delays, dropouts, and a sampler of one kernel.
 
 The engine makes and reads state sensors by `make_sampler` and `sample_packet`, which say by the sensor's name
 what the code of one lacks.

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined,call-overload"
-"""What the cameras see of a batch: which instants each group renders, in one launch each, and the packets."""
+"""The cameras of a batch: the instants that each group renders, in one launch each, and the packets."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class RenderJob:
 
     group: RenderGroupState
     buffers: BatchBuffers
-    """What is overwritten."""
+    """The arrays that are overwritten."""
     trace: Trace
     stamps_ns: Sequence[int]
     """Stamps of the instants, of the clock that all worlds share [ns]."""
@@ -264,8 +264,8 @@ def scan(state: State, batch: Batch) -> None:
         state.batch_done[batch.number % len(state.batch_done)].set()
 
 
-def _is_late(batch: Batch) -> bool:
-    """Return whether all that cameras yield is pictures in buffers of the caller, and all count."""
+def _is_all_in_place(batch: Batch) -> bool:
+    """Return whether the whole batch counts, and yields only pictures in buffers of the caller."""
     return batch.until_ns == batch.boundaries[-1].stamp_ns and all(
         not job.frames and len(job.picture_buffers) == len(job.pictures) for job in batch.jobs or ()
     )
@@ -282,7 +282,7 @@ def read_cameras(
     packets: list[Packet] = []
     jobs = batch.jobs or ()
     with timed(state.wall_s, "camera read-back"):
-        if not (state.pictures_in_place and _is_late(batch)):
+        if not (state.pictures_in_place and _is_all_in_place(batch)):
             state.batch_done[batch.number % len(state.batch_done)].wait()
         readings = [
             job.group.frames[name].begin_read(job.stamps_ns, until_ns=batch.until_ns)
@@ -345,7 +345,7 @@ def _on_device(group: RenderGroupState, key: Hashable, slots: Callable[[], Any])
 
 
 class WorldFrames(NamedTuple):
-    """What the frame sensors of a group see of a batch in many worlds."""
+    """The frames of a batch that the frame sensors of a group see in many worlds."""
 
     group: RenderGroupState
     offsets_ns: tuple[int, ...]

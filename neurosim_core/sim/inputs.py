@@ -1,5 +1,5 @@
 # mypy: disable-error-code="index,attr-defined,misc,arg-type,operator,call-overload,valid-type"
-"""What users hand to worlds, from the host or on the device: commands, seeds, masks, where vehicles begin."""
+"""Inputs of worlds, from the host or on the device: commands, seeds, masks, initial states of vehicles."""
 
 # No `from __future__ import annotations`: Warp needs the annotations of structures as objects.
 
@@ -153,7 +153,7 @@ def checked_seeds(seed: Any, count: int, device: Any) -> Any:
 
 @wp.struct
 class Start:
-    """Where vehicles begin, one row for each world."""
+    """Initial states of vehicles, one row for each world."""
 
     position: wp.array2d[wp.float64]  # p_WB [m], [N, 3]
     velocity: wp.array2d[wp.float64]  # v_WB in W [m/s], [N, 3]

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined"
-"""What does not change during a run: the scene, the path, and what has to be computed of them."""
+"""The model of a run, which does not change during it: the scene, the path, and what is computed of them."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ within 20 ms, what is interpolated between is off by less than 1e-7 of an amplit
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """What does not change during a run."""
+    """The data that do not change during a run."""
 
     config: SimulationConfig
     device: str
     scene: Scene
     bodies: tuple[Body, ...]
-    """What moves in the scene besides the vehicle; not loaded without cameras."""
+    """Bodies that move in the scene besides the vehicle; not loaded without cameras."""
     free_space: FreeSpace
     path: Path
     airframe: MultirotorConfig

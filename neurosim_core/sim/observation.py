@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined,union-attr"
-"""What many worlds yield in a step: arrays on the device."""
+"""The observation of many worlds after a step: arrays on the device."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neurosim_core.vehicle.arrays import MultirotorArrays
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Samples:
-    """What a state sensor measured in a step, in the order of time, valid until the next step or reset."""
+    """The samples of a state sensor in a step, in the order of time, valid until the next step or reset."""
 
     arrays: Mapping[str, Any]
     """By name, as the fields of its packets: device arrays of shape [sample, N, ...]."""
@@ -26,14 +26,14 @@ class Samples:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observation:
-    """What all worlds yield in a step: arrays on the device that the next step or reset overwrites."""
+    """The results of all worlds after a step: arrays on the device that the next step or reset overwrites."""
 
     state: MultirotorArrays
     """The states of all vehicles at the end of the step."""
     clock_ns: wp.array[wp.int64]
     """Time since the reset of each world [ns], shape [N]."""
     frames: Mapping[str, Any]
-    """What each frame sensor found: of an event camera, `sensors.event_worlds.WorldEvents`."""
+    """Results of each frame sensor: of an event camera, `sensors.event_worlds.WorldEvents`."""
     images: Mapping[str, Any]
     """The last picture of each image sensor: rgb, uint8 [N, H, W, 3]; depth [m], float32 [N, H, W]; ..."""
     fresh: frozenset[str]

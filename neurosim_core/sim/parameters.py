@@ -1,4 +1,4 @@
-"""What differs from world to world: arrays of settings of cameras -> the cameras of each world, checked."""
+"""Parameters that differ from world to world: arrays of camera settings -> the cameras of each world."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Rig = dict[str, SensorConfig]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WorldSettings:
-    """How worlds that are stepped together differ, and what their results are."""
+    """Settings of worlds that are stepped together: their differences and their results."""
 
     scenes: SceneTable
     seeds: Sequence[int]

@@ -73,26 +73,26 @@ class ImageChannel:
 
     @property
     def output(self) -> str:
-        """What is rendered for it."""
+        """The render outputs that it needs."""
         return self.config.output
 
 
 @dataclass(kw_only=True, eq=False)
 class BatchBuffers:
-    """What a group writes for one batch in flight."""
+    """The buffers that a group writes for one batch in flight."""
 
     renderer: Renderer
     copies: Mapping[str, HostCopy]
     """Pictures on the host by source; empty: they stay on the device."""
     processes: Mapping[str, PictureProcess]
-    """What pictures go through on the device, by the name of the sensor."""
+    """Processing of pictures on the device, by the name of the sensor."""
     p_WC: wp.array[wp.vec3]
-    """Where the camera is at the instants [m], shape [N K]; [N K J] where rays have times of their own."""
+    """Positions of the camera at the instants [m], shape [N K]; [N K J] where rays have own times."""
     q_WC: wp.array[wp.quat]
     stamps: Any
     """Times of the instants [ns], shape [N K, 1], or [N K J, 1]; empty if nobody asks."""
     bodies: BodyPoses | None
-    """Where bodies are at the instants; None: nothing moves but the vehicle."""
+    """Poses of bodies at the instants; None: nothing moves but the vehicle."""
     chosen_slots: HostInput | None
     """Slots of the ticks chosen, which do not come again; None: all ticks are rendered."""
 
@@ -110,7 +110,7 @@ class RenderGroupState:
     """M, the most pictures of one batch in each world."""
     rate: Rate
     worlds: RenderWorlds
-    """Who is rendered together."""
+    """The cameras that are rendered together."""
     times: RayTimes | None
     """When rays are cast; None: at the instant."""
     images: dict[str, ImageChannel]
@@ -123,7 +123,7 @@ class RenderGroupState:
     pictures: dict[str, Any] = field(default_factory=dict)
     """The last picture of each image sensor, where they stay on the device: arrays [N, H, W, ...]."""
     shared_pictures: dict[str, Any] = field(default_factory=dict)
-    """What the renderer wrote, for image sensors whose last picture another one of the group replaces."""
+    """Pictures of the renderer, for image sensors whose last picture another one of the group replaces."""
     parity: int = 0
     """Which of the two states of `world_frames` is the present one."""
     p_BC: Any

@@ -106,9 +106,9 @@ class PendingStep(NamedTuple):
     """A control period that has been launched as far as it can be."""
 
     packets: list[Packet]
-    """What the sensors yield up to its beginning, if that has not been returned yet."""
+    """Packets of the sensors up to its beginning, if they have not been returned yet."""
     end_ns: int
-    """Where it ends [ns]."""
+    """Its end [ns]."""
 
 
 def begin_step(

@@ -46,7 +46,7 @@ class SceneTable:
     """Arrays of each scene, or of each world, with all that a kernel for all scenes reads; empty: `data` is
     None."""
     terms: RenderTerms | None
-    """What some scene needs in the kernel of the renderer; None: there is no camera."""
+    """Terms of the renderer's kernel that some scene needs; None: there is no camera."""
 
     @property
     def model(self) -> Model:

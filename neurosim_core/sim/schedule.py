@@ -1,4 +1,4 @@
-"""What happens when: the boundaries of a run, in integer nanoseconds, as a pure function of its rates."""
+"""The schedule: the boundaries of a run, in integer nanoseconds, as a pure function of its rates."""
 
 from __future__ import annotations
 

@@ -144,7 +144,7 @@ class Simulation:
 
     @property
     def model(self) -> Model:
-        """What does not change, of the first scene."""
+        """The model of the first scene, which does not change."""
         return self._model
 
     @property

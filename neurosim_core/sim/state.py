@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined,call-overload"
-"""What changes during a run: the vehicles of all worlds, the buffers of their sensors, and the progress."""
+"""The state of a run: the vehicles of all worlds, the buffers of their sensors, and the progress."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Batch:
     until_ns: int
     """Packets up to here count [ns]: less than the whole batch where a collision ends the run."""
     jobs: Sequence[RenderJob] | None = None
-    """What groups render of it; None: that was not planned yet."""
+    """The instants that groups render of it; None: not planned yet."""
     left_out_count: int = 0
     """Ticks that adaptive groups do not render."""
     coarse_count: int = 0
@@ -91,7 +91,7 @@ class Batch:
 
 @dataclass(kw_only=True, eq=False)
 class State:
-    """What changes during a run."""
+    """The data that change during a run."""
 
     world_count: int
     on_host: bool
@@ -100,14 +100,14 @@ class State:
     worlds: Any
     """The vehicles and the clocks of their worlds as kernels see them (`trace.WorldArrays`)."""
     start: Any
-    """Where vehicles begin, one row for each world (`inputs.Start`)."""
+    """Initial states of vehicles, one row for each world (`inputs.Start`)."""
     path_controller: PathController | None
     """None: the path prescribes the motion."""
     trace: Trace
     groups: list[RenderGroupState]
     samplers: dict[str, Sampler]
     sampler_copies: dict[str, dict[str, HostCopy]]
-    """What each sampler measures on the host, in the slots of the trace; empty: it stays on the device."""
+    """Measurements of each sampler on the host, in the slots of the trace; empty: they stay on the device."""
     seeds: Any
     """Seed of each world, device array of uint64."""
     batch_done: Sequence[Fence]
@@ -121,13 +121,13 @@ class State:
     wanted: frozenset[str]
     """Cameras that look, from the next batch on."""
     flight_stream: wp.Stream | None
-    """Where the vehicle moves, ahead of the renderers; with one batch in flight nothing overlaps."""
+    """Stream of the vehicle's motion, ahead of the renderers; with one batch in flight nothing overlaps."""
     render_streams: Sequence[wp.Stream | None]
     """For each batch in flight: the last rays of one and the first of the next fill the device together."""
     event_stream: wp.Stream | None
-    """Where events are found, while the next batch is rendered."""
+    """Stream of the event scan, while the next batch is rendered."""
     choice_stream: wp.Stream | None
-    """Where adaptive groups choose what to render, ahead of the renderers."""
+    """Stream on which adaptive groups choose the instants to render, ahead of the renderers."""
     overlaps: bool
     """Parts of a batch are launched on their own; on a CUDA device with one batch in flight, all as one
     graph, unless an adaptive group or the host has to wait for the flight."""
@@ -137,9 +137,9 @@ class State:
     """End of the batch whose rendering was launched last."""
     graphs: GraphCache
     stamp_ns: int = 0
-    """How far packets have been returned [ns]."""
+    """Time up to which packets have been returned [ns]."""
     launched_ns: int = 0
-    """How far the device has been told to go [ns]."""
+    """Time up to which work has been launched [ns]."""
     launched_count: int = 0
     """Batches flown so far."""
     rendered_count: int = 0
@@ -147,7 +147,7 @@ class State:
     last: Odometry | None = None
     """The state at the end of what was flown and read."""
     controllers: dict[str, Controller] = field(default_factory=dict)
-    """Who turns setpoints into rotor speeds, in the command modes that were used."""
+    """Converters from setpoints to rotor speeds, of the command modes that were used."""
     commands: dict[str, CommandBuffer] = field(default_factory=dict)
     """The setpoints of each mode that was used."""
     command_mode: CommandMode | None = None

@@ -27,7 +27,7 @@ ROTOR_SPEED = slice(13, None)
 
 @wp.struct
 class Surfaces:
-    """What vehicles can touch: the scene that each world is in, and the ground."""
+    """Surfaces that vehicles can touch: the scene of each world, and the ground."""
 
     fields: wp.array[DistanceField]  # Distance to each scene, shape [scene]
     scene: wp.array[int]  # Which of them a world is in, shape [world]
@@ -61,7 +61,7 @@ class TraceArrays:
 
 @wp.struct
 class TraceContext:
-    """What `record_state` reads and writes."""
+    """The arrays that `record_state` reads and writes."""
 
     surfaces: Surfaces
     worlds: WorldArrays
