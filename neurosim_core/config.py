@@ -31,7 +31,7 @@ from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.sensors.imu import ImuConfig
 from neurosim_core.sensors.odometry import OdometrySensorConfig
 from neurosim_core.sensors.rgb import RgbSensorConfig
-from neurosim_core.settings import OfKind, Settings, documentation
+from neurosim_core.settings import BaseConfig, OfKind, documentation
 from neurosim_core.settings_file import ConfigError, beside, merge, nest, read_file
 from neurosim_core.sinks import SinkConfig, check_files, default_sinks
 from neurosim_core.trajectory import CollisionFreeConfig, PathConfig, TourConfig
@@ -70,7 +70,7 @@ AnyVehicle = Annotated[VehicleConfig, OfKind("vehicle", default=_DEFAULT_KINDS["
 AnyController = Annotated[ControllerConfig, OfKind("controller", default=_DEFAULT_KINDS["control"])]
 AnySink = Annotated[SinkConfig, OfKind("sink")]
 AnyRenderer = Annotated[RendererConfig, OfKind("renderer", default=_DEFAULT_KINDS["renderer"])]
-_PATHS: tuple[type[Settings], ...] = get_args(get_args(PathConfig)[0])
+_PATHS: tuple[type[BaseConfig], ...] = get_args(get_args(PathConfig)[0])
 Sensors = Annotated[dict[Name, AnySensor], AfterValidator(expand_stereo)]
 Links = dict[Name, LinkConfig]
 
@@ -85,7 +85,7 @@ _RESERVED = {
 _SEED_STRIDE = 0x9E3779B97F4A7C15
 
 
-class FleetMember(Settings):
+class FleetMember(BaseConfig):
     """One of several vehicles: what differs from the settings of the same name above it."""
 
     vehicle: AnyVehicle | None = None
@@ -100,7 +100,7 @@ class FleetMember(Settings):
     """Its links; null: the common ones."""
 
 
-class SimulationConfig(Settings):
+class SimulationConfig(BaseConfig):
     """Everything that decides the outcome of a run: same config, same device type, same bits."""
 
     duration_s: Annotated[float, Field(gt=0.0, le=1e6)] = 4.0

@@ -18,7 +18,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 from pydantic import model_validator
 
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 Vector3 = tuple[float, float, float]
 
@@ -35,7 +35,7 @@ _MOUNT_MAX_M = 20.0
 """What is mounted further from the body was meant in millimetres [m]."""
 
 
-class Mount(Settings):
+class Mount(BaseConfig):
     """Where a sensor sits on the body: exactly T_BS, no hidden lift or lever arm."""
 
     position_m: Vector3 = (0.0, 0.0, 0.0)

@@ -23,7 +23,7 @@ from neurosim_core.settings_file import merge
 _NO_NUMBER = PydanticCustomError("no_number", "must be a number")
 
 
-class Settings(BaseModel):
+class BaseConfig(BaseModel):
     """A frozen group of settings.
 
     Unknown keys, non-finite numbers and values out of range are refused with a `ValueError` (pydantic's

@@ -19,7 +19,7 @@ from neurosim_core.clock import NS_PER_S
 from neurosim_core.install import install_hint
 from neurosim_core.packets import Events, Packet
 from neurosim_core.registry import register
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 if TYPE_CHECKING:
     from neurosim_core.io.event_file import EventWriter
@@ -72,7 +72,7 @@ class SinkContext:
     it stops waiting."""
 
 
-class SinkConfig(Settings):
+class SinkConfig(BaseConfig):
     """Settings that all sinks have. A kind adds its `kind`, what it needs, and `open`."""
 
     kind: str

@@ -14,7 +14,7 @@ from neurosim_core.control.modes import Controller
 from neurosim_core.control.se3 import Se3Config
 from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.registry import register
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 from neurosim_core.trajectory.path import Path, PathCursor
 from neurosim_core.vehicle.airframe import MultirotorConfig
 from neurosim_core.vehicle.arrays import MultirotorState
@@ -48,7 +48,7 @@ class ControllerContext:
     """Device of the states of the vehicles."""
 
 
-class ControllerConfig(Settings):
+class ControllerConfig(BaseConfig):
     """Settings that all controllers have. A kind adds its `kind`, what it needs, and `make`."""
 
     kind: str

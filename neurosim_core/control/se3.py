@@ -20,7 +20,7 @@ from pydantic import Field
 
 from neurosim_core.control.allocation import Motors, clip
 from neurosim_core.control.flatness import AttitudeReference, Heading, attitude_reference
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 from neurosim_core.trajectory.path import PathPoint
 from neurosim_core.vehicle.airframe import MultirotorConfig
 from neurosim_core.vehicle.command_ranges import command_ranges
@@ -37,7 +37,7 @@ _SQUARABLE = wp.constant(wp.float64(1.0e100))
 """The square of a number up to this one is finite."""
 
 
-class Se3Config(Settings):
+class Se3Config(BaseConfig):
     """Gains and limits of the geometric controller.
 
     Gains are per unit mass and inertia, hence natural frequencies and damping: position sqrt(10) = 3.2 rad/s,

@@ -39,7 +39,7 @@ from neurosim_core.record import RecordingHeader, RecordingWriter, SensorDescrip
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.sensors.event_config import EventCameraConfig, event_presets
 from neurosim_core.sensors.events import EventCamera
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 SENSOR = "events"
 """Name of the camera in the file."""
@@ -55,7 +55,7 @@ _CODE_STEP_MAX = 0.5
 """Largest change of log radiance by one step of the stored numbers, in thresholds."""
 
 
-class ConversionConfig(Settings):
+class ConversionConfig(BaseConfig):
     """How a video becomes events."""
 
     pixel: EventCameraConfig = EventCameraConfig()

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 LiveMode = Literal["lockstep", "streaming"]
 FailSafe = Literal["hover", "cut", "hold"]
@@ -14,7 +14,7 @@ Delay = Annotated[float, Field(ge=0.0, le=5.0)]
 """A longer one was meant in milliseconds."""
 
 
-class LiveConfig(Settings):
+class LiveConfig(BaseConfig):
     """How time passes, and what happens when a controller or the machine is too slow."""
 
     mode: LiveMode = "streaming"
@@ -43,7 +43,7 @@ class LiveConfig(Settings):
     """Continue after `duration_s`, until stopped. false: end there."""
 
 
-class LinkConfig(Settings):
+class LinkConfig(BaseConfig):
     """What a simulated link does to messages between simulator and controller, in simulated time; seeded.
 
     A link keeps the order of its messages: a delayed message delays those behind it.

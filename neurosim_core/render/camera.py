@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 
 class Lens(Protocol):
@@ -51,7 +51,7 @@ class Intrinsics(NamedTuple):
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
 
-class PinholeConfig(Settings):
+class PinholeConfig(BaseConfig):
     """A pinhole camera, given by its field of view or by fx, fy, cx, cy, not by both."""
 
     distortion_model: ClassVar[str] = ""

@@ -6,13 +6,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 TextureFilter = Literal["trilinear", "bilinear", "nearest"]
 """Names of the ways to read a texture; see `RenderConfig.texture_filter`."""
 
 
-class LightingConfig(Settings):
+class LightingConfig(BaseConfig):
     """How surfaces are lit: Lambert, hemispheric ambient, the lights of the scene."""
 
     mode: Literal["baked", "unshadowed"] = "baked"
@@ -45,7 +45,7 @@ class LightingConfig(Settings):
         return self
 
 
-class CandidateListConfig(Settings):
+class CandidateListConfig(BaseConfig):
     """Candidate lists of tiles of 8 x 8 pixels; they change speed, not results."""
 
     instants: int = Field(default=32, ge=1, le=256)
@@ -55,7 +55,7 @@ class CandidateListConfig(Settings):
     """Capacity of a list: the rays of a tile with more triangles traverse the tree."""
 
 
-class RenderConfig(Settings):
+class RenderConfig(BaseConfig):
     """How pictures are computed, the same for all cameras of a run."""
 
     cpu_traversal: Literal["auto", "embree", "warp"] = "auto"

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from neurosim_core.render.camera import Intrinsics, PinholeConfig
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 Vectors = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ _ANGLE_MAX_RAD = math.radians(89.0)
 _TABLE_SIZE = 4096
 
 
-class _Lens(Settings):
+class _Lens(BaseConfig):
     """The base class of all lenses but the pinhole."""
 
     width: int = Field(gt=0, le=16384)

@@ -19,7 +19,7 @@ from pydantic import Field, model_validator
 
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.render.camera import Lens
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 INSTANT_COUNT_MAX = 65536
 """Most instants of one picture."""
@@ -64,7 +64,7 @@ class SweepTiming:
         return RayTimes(offsets_ns, np.ascontiguousarray(instant.reshape(1, -1), dtype=np.int32), 1)
 
 
-class ShutterConfig(Settings):
+class ShutterConfig(BaseConfig):
     """When the lines of a picture are exposed: all at the stamp, unless it says otherwise.
 
     Lines are rows, or columns, and are read one after the other; the last one is read at the stamp. A line is

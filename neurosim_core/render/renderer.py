@@ -19,7 +19,7 @@ from neurosim_core.render.synthetic_renderer import SyntheticRenderer, Synthetic
 from neurosim_core.render.warp_renderer import ONE_WORLD, RenderWorlds, WarpRenderer
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.scene import Scene
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 __all__ = [
     "ONE_WORLD",
@@ -80,7 +80,7 @@ class Renderer(Protocol):
         """
 
 
-class RendererConfig(Settings):
+class RendererConfig(BaseConfig):
     """Settings of a renderer. A kind adds its `kind`, what it needs, `scene_type`, `upload` and `make`."""
 
     kind: str

@@ -28,7 +28,7 @@ from pydantic import Field, field_validator
 from neurosim_core.frames import Vector3, quaternion_exp
 from neurosim_core.scene.body_shapes import BoxShape, ShapeConfig, SurfaceConfig, make_solid
 from neurosim_core.scene.scene import Scene
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,7 +36,7 @@ _TWO_PI = wp.constant(wp.float64(2.0 * np.pi))
 _S_PER_NS = wp.constant(wp.float64(1e-9))
 
 
-class SwayConfig(Settings):
+class SwayConfig(BaseConfig):
     """A sinusoid along a line: amplitude sin(2 pi f t + phase)."""
 
     amplitude_m: Vector3 = (0.0, 0.5, 0.0)
@@ -47,7 +47,7 @@ class SwayConfig(Settings):
     """Phase at t = 0 [rad]."""
 
 
-class OrbitConfig(Settings):
+class OrbitConfig(BaseConfig):
     """A circle at constant speed around `position_m`; the body does not turn with it (see `spin_rad_s`)."""
 
     radius_m: Annotated[float, Field(ge=0.0, le=1e4)] = 0.5
@@ -76,7 +76,7 @@ class OrbitConfig(Settings):
         return np.stack([first, np.cross(normal, first)])
 
 
-class MotionConfig(Settings):
+class MotionConfig(BaseConfig):
     """The pose of a body as a function of time; parts that are given add up, see `scene.bodies`."""
 
     position_m: Vector3 = (0.0, 0.0, 0.0)
@@ -99,7 +99,7 @@ _ABSENT = MotionConfig(position_m=(0.0, 0.0, -1e6))
 """Where a body is that is not in the scene: nothing of it is larger than a pixel from there."""
 
 
-class BodyConfig(Settings):
+class BodyConfig(BaseConfig):
     """A rigid body that moves by itself."""
 
     shape: ShapeConfig = BoxShape()

@@ -14,7 +14,7 @@ from neurosim_core.scene.scene import LinearRgb, Material, Scene, Texture
 from neurosim_core.scene.solids import Part, grid_surface, merge, picture_quad, without_slivers
 from neurosim_core.scene.source import Axis, SceneError
 from neurosim_core.scene.srgb import linear_to_srgb8
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 _SIDES = 128
 """Facets around a sphere or a cylinder: the surface is inside the true one by at most 3e-4 of the radius."""
@@ -26,7 +26,7 @@ Albedo = Annotated[float, Field(ge=0.0, le=1.0)]
 Color = tuple[Albedo, Albedo, Albedo]
 
 
-class BoxShape(Settings):
+class BoxShape(BaseConfig):
     """A box about the origin of the body."""
 
     kind: Literal["box"] = "box"
@@ -34,7 +34,7 @@ class BoxShape(Settings):
     """Lengths of the edges along x, y and z of the body [m]."""
 
 
-class SphereShape(Settings):
+class SphereShape(BaseConfig):
     """A sphere about the origin of the body."""
 
     kind: Literal["sphere"] = "sphere"
@@ -42,7 +42,7 @@ class SphereShape(Settings):
     """Radius [m]."""
 
 
-class CylinderShape(Settings):
+class CylinderShape(BaseConfig):
     """A closed cylinder about the z axis of the body, its middle in the origin."""
 
     kind: Literal["cylinder"] = "cylinder"
@@ -52,7 +52,7 @@ class CylinderShape(Settings):
     """Length along the axis [m]."""
 
 
-class MeshShape(Settings):
+class MeshShape(BaseConfig):
     """A mesh file; its origin is that of the body."""
 
     kind: Literal["mesh"] = "mesh"
@@ -66,7 +66,7 @@ class MeshShape(Settings):
     """Added to every point, after units and axes [m]: brings the point about which it turns to the origin."""
 
 
-class PlainSurface(Settings):
+class PlainSurface(BaseConfig):
     """One colour."""
 
     kind: Literal["plain"] = "plain"
@@ -74,7 +74,7 @@ class PlainSurface(Settings):
     """Albedo, linear red, green, blue in [0, 1]."""
 
 
-class CheckerSurface(Settings):
+class CheckerSurface(BaseConfig):
     """Squares of two colours, aligned with the edges of a face; a whole number around what is round."""
 
     kind: Literal["checker"] = "checker"
@@ -86,7 +86,7 @@ class CheckerSurface(Settings):
     """Albedo of its neighbours, likewise."""
 
 
-class PictureSurface(Settings):
+class PictureSurface(BaseConfig):
     """A picture that repeats, upright on a face; around a sphere or cylinder a whole number of times."""
 
     kind: Literal["picture"] = "picture"

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from neurosim_core.scene.scene import Scene
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 
-class SceneConfig(Settings):
+class SceneConfig(BaseConfig):
     """Settings of a scene. A kind adds its `kind`, what it needs, and `load`."""
 
     kind: str

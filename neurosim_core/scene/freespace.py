@@ -28,7 +28,7 @@ from pydantic import Field
 
 from neurosim_core.frames import Vector3
 from neurosim_core.scene.scene import Scene
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,7 +46,7 @@ _BESIDE_M = 3.0
 """How far free space reaches from a scene that is flat, such as a ground or a poster [m]."""
 
 
-class FreeSpaceConfig(Settings):
+class FreeSpaceConfig(BaseConfig):
     """How finely the room in a scene is mapped."""
 
     voxel_m: float = Field(default=0.1, ge=1e-6)

@@ -16,7 +16,7 @@ from neurosim_core.scene.apartment.pieces import Piece
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.scene import Light, Scene
 from neurosim_core.scene.solids import box, quad
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 _LAMPS_APART_M = 8.0
 _POSTER_M = 2.0
@@ -26,7 +26,7 @@ _LOOKS = 6
 Length = Annotated[float, Field(gt=0.0)]
 
 
-class BoxConfig(Settings):
+class BoxConfig(BaseConfig):
     """A box in a hall."""
 
     position_m: Vector3

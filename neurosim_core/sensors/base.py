@@ -23,7 +23,7 @@ from neurosim_core.packets import Image, ImageEncoding, Packet, schema_of
 from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.lenses import AnyLens
 from neurosim_core.render.ray_times import RayTimes, RayTiming, ShutterConfig
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 from neurosim_core.vehicle import Multirotor
 
 RateHz = Annotated[float, Field(gt=0.0, le=1e6)]
@@ -45,7 +45,7 @@ class RenderRequest(NamedTuple):
     """Ticks that are rendered in any case."""
 
 
-class SensorConfig(Settings):
+class SensorConfig(BaseConfig):
     """Settings of a sensor. Subclasses add `kind: Literal["..."]` and are registered under that kind."""
 
     packet_type: ClassVar[type[Packet]]
@@ -151,7 +151,7 @@ class StateSensorConfig(SensorConfig):
         raise NotImplementedError(f"{type(self).__name__} must say how it is made")
 
 
-class StereoConfig(Settings):
+class StereoConfig(BaseConfig):
     """A second camera beside the first."""
 
     baseline_m: Annotated[float, Field(gt=0.0)]

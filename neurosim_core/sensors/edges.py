@@ -16,7 +16,7 @@ from neurosim_core.registry import register
 from neurosim_core.sensors.base import ImageSensorConfig, PictureContext
 from neurosim_core.sensors.instance import LabelImage
 from neurosim_core.sensors.pixel_process import Batch, Element, PixelProcess, element_of, make_rays
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,7 +24,7 @@ KINDS = ("none", "depth", "object", "crease")
 """What the labels 0 to 3 mean."""
 
 
-class EdgeLimits(Settings):
+class EdgeLimits(BaseConfig):
     """What is an edge, and what is rendered to find it."""
 
     jump_ratio: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.02

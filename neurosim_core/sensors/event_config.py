@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
 from neurosim_core.registry import register
 from neurosim_core.sensors.event_noise_model import TERMS, NoiseTermConfig, parse_terms
-from neurosim_core.settings import Settings, fill_from_preset
+from neurosim_core.settings import BaseConfig, fill_from_preset
 from neurosim_core.settings_file import read_table
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -118,7 +118,7 @@ class ShotNoiseConfig(NoiseTermConfig):
     """Whether the rate of a polarity is inversely proportional to the threshold of the pixel, as in v2e."""
 
 
-class NoiseLevelConfig(Settings):
+class NoiseLevelConfig(BaseConfig):
     """Events without cause in one light, as they were measured."""
 
     lux: Annotated[float, Field(ge=1e-6, le=1e7)]
@@ -217,7 +217,7 @@ class StochasticConfig(NoiseTermConfig):
         return self
 
 
-class ReadoutConfig(Settings):
+class ReadoutConfig(BaseConfig):
     """The arbiter between the pixels and the bus: events wait for it, and are stamped when they are read.
 
     `event`: one event at a time, in the order in which they came. `row`: the row with the oldest event that
@@ -271,7 +271,7 @@ def describe_pixel(pixel: EventCameraConfig) -> str:
     return ", ".join([*parts, *(present or ["ideal"])])
 
 
-class EventCameraConfig(Settings):
+class EventCameraConfig(BaseConfig):
     """An event camera, by default ideal: the same two thresholds in every pixel, no noise, no dead time.
 
     What counts as reaching a threshold, when samples are rounded to float32, is in `EventCamera`.

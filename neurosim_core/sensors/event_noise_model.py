@@ -45,7 +45,7 @@ from pydantic import ValidationError
 
 from neurosim_core.config_errors import explain
 from neurosim_core.registry import find
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 wp.set_module_options({"enable_backward": False})
 
@@ -112,7 +112,7 @@ class PixelModel:
 _SIGNAL = (SignalTerm, wp.uint64, wp.int32, wp.int64, wp.float64)
 
 
-class NoiseTermConfig(Settings):
+class NoiseTermConfig(BaseConfig):
     """A way in which pixels depart from the ideal; a package registers its own as `noise`, by kind.
 
     A term of another package changes what a pixel sees: it extends this class by its `kind`, its keys,

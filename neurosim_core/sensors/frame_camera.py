@@ -31,7 +31,7 @@ from neurosim_core.registry import register
 from neurosim_core.render.launch import kernel_variant
 from neurosim_core.sensors.base import ImageSensorConfig, PictureContext, PictureViews
 from neurosim_core.sensors.pixel_process import Batch, PixelProcess, element_of
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 _FIXED = wp.constant(wp.float64(2.0**20))
@@ -39,7 +39,7 @@ _FIXED = wp.constant(wp.float64(2.0**20))
 _DARKEST = wp.constant(1.0e-6)
 
 
-class AutoExposureConfig(Settings):
+class AutoExposureConfig(BaseConfig):
     """Exposure that follows the light."""
 
     target: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.18

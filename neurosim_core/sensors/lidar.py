@@ -33,7 +33,7 @@ from neurosim_core.render.ray_times import SweepTiming
 from neurosim_core.sensors.base import PictureContext, PictureSensorConfig
 from neurosim_core.sensors.lidar_scans import AnyScan, SpinningScan
 from neurosim_core.sensors.pixel_process import Batch, PixelProcess, element_of
-from neurosim_core.settings import Settings, fill_from_preset
+from neurosim_core.settings import BaseConfig, fill_from_preset
 from neurosim_core.settings_file import read_table
 
 NonNegative = Annotated[float, Field(ge=0.0)]
@@ -53,7 +53,7 @@ def lidar_presets() -> dict[str, dict[str, Any]]:
     return presets
 
 
-class DetectionConfig(Settings):
+class DetectionConfig(BaseConfig):
     """Which rays come back."""
 
     range_m: Annotated[float, Field(gt=0.0)]

@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 _ROWS = (8, 7, 6, 5, 4, 3, 2)  # of a pattern: neighbours in time are cast together
 
 DivergenceRad = Annotated[float, Field(gt=0.0, le=0.1)]
 
 
-class Scan(Settings):
+class Scan(BaseConfig):
     """Settings that all scans have."""
 
     divergence_rad: DivergenceRad = 0.003

@@ -31,7 +31,7 @@ from neurosim_core.packets import Packet
 from neurosim_core.random import normal2, random_bits, stream_id, uniform2
 from neurosim_core.render.launch import kernel_variant
 from neurosim_core.sensors.base import RateHz, Sampler, SamplerContext, StateSensorConfig
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 wp.set_module_options({"enable_backward": False})
 
@@ -42,7 +42,7 @@ Probability = Annotated[float, Field(ge=0.0, lt=1.0)]
 _DROPOUT = 1 << 20
 
 
-class ErrorConfig(Settings):
+class ErrorConfig(BaseConfig):
     """Errors of what is measured, in its unit: one number for all axes, or one for each; none by default."""
 
     white: Axes = 0.0

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 from neurosim_core.trajectory.path import Path, restriction
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ _PARTS = 16
 """Parts a piece is cut into for its bounds."""
 
 
-class FlightLimits(Settings):
+class FlightLimits(BaseConfig):
     """Limits of what a path asks of the vehicle; they hold everywhere on the path."""
 
     speed_max_m_s: float = Field(default=3.0, gt=0.0, le=200.0)

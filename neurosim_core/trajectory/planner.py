@@ -23,7 +23,7 @@ from pydantic import Field, model_validator
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.frames import Vector3
 from neurosim_core.scene.freespace import FreeSpace
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 from neurosim_core.trajectory.certify import prove_clearance
 from neurosim_core.trajectory.feasibility import FlightLimits, flight_bounds, time_factor
 from neurosim_core.trajectory.heading import follow_travel
@@ -56,7 +56,7 @@ class PlanningError(ValueError):
     """No path: the message names the leg and the reason."""
 
 
-class CollisionFreeConfig(Settings):
+class CollisionFreeConfig(BaseConfig):
     """Settings that all planned paths have."""
 
     clearance_m: float = Field(default=0.3, gt=0.0)

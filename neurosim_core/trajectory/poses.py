@@ -23,7 +23,7 @@ from pydantic import Field, model_validator
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.frames import Q_FORWARD_OPTICAL, Vector3
 from neurosim_core.install import install_hint
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 from neurosim_core.trajectory.path import Attitude, Path
 
 _log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ _FORMATS: dict[str, tuple[str, float, tuple[int, ...]]] = {
 """What a row is, the length of its unit of time [s], and where time, position and quaternion (xyzw) stand."""
 
 
-class KeyframeConfig(Settings):
+class KeyframeConfig(BaseConfig):
     """A pose at an instant."""
 
     time_s: float
@@ -55,7 +55,7 @@ class KeyframeConfig(Settings):
     """Roll, pitch, yaw of the body [rad]: R = Rz(yaw) Ry(pitch) Rx(roll)."""
 
 
-class PosesConfig(Settings):
+class PosesConfig(BaseConfig):
     """A motion that is prescribed: the sensors follow it exactly, also through walls, without dynamics.
 
     Time begins at the first pose. Before the first and after the last pose the rig rests. It takes no

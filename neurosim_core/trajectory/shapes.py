@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from neurosim_core.clock import NS_PER_S, to_ns
 from neurosim_core.frames import Vector3
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 from neurosim_core.trajectory.heading import follow_travel
 from neurosim_core.trajectory.minsnap import hermite_matrix, minimum_snap
 from neurosim_core.trajectory.path import Path
@@ -36,7 +36,7 @@ _RAMP = Polynomial([0.0] * 5 + [126.0, -420.0, 540.0, -315.0, 70.0])
 """Rises from 0 to 1 on [0, 1] with four derivatives zero at both ends."""
 
 
-class ShapeConfig(Settings):
+class ShapeConfig(BaseConfig):
     """Settings that all closed-form paths have."""
 
     yaw: Literal["travel"] | float = 0.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from neurosim_core.frames import Vector3
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 from neurosim_core.settings_file import read_table
 from neurosim_core.vehicle.aerodynamics import (
     AIR_TERMS,
@@ -42,7 +42,7 @@ TERMS = (
 NonNegative = Annotated[float, Field(ge=0.0)]
 
 
-class MultirotorConfig(Settings):
+class MultirotorConfig(BaseConfig):
     """Parameters of a multirotor whose rotors all push along body z. What is 0 is not computed."""
 
     mass_kg: Annotated[float, Field(gt=0.0)]

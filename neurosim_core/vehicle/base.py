@@ -11,7 +11,7 @@ import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field
 
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 from neurosim_core.vehicle.airframe import MultirotorConfig
 from neurosim_core.vehicle.arrays import (
     STATUS_BODY_RATE,
@@ -37,7 +37,7 @@ class VehicleContext:
     """Seed of each world, device array of uint64, shape [N]."""
 
 
-class VehicleConfig(Settings):
+class VehicleConfig(BaseConfig):
     """Settings that all vehicles have. A kind adds its `kind`, what it needs, `airframe` and `make`."""
 
     kind: str

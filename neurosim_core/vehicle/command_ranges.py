@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 if TYPE_CHECKING:
     from neurosim_core.vehicle.airframe import MultirotorConfig
@@ -21,7 +21,7 @@ SPEED_CEILING_M_S = 100.0
 Range = Annotated[float, Field(gt=0.0, le=1e6)]
 
 
-class CommandRangesConfig(Settings):
+class CommandRangesConfig(BaseConfig):
     """The largest commands that a vehicle accepts. null stands for what its physics gives."""
 
     beyond: Literal["clamp", "refuse"] = "clamp"

@@ -20,10 +20,10 @@ import warp as wp
 from pydantic import Field
 
 from neurosim_core.frames import Vector3
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 
 
-class GroundConfig(Settings):
+class GroundConfig(BaseConfig):
     """A horizontal plane that the vehicle can stand on; to touch it is no collision."""
 
     height_m: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0

@@ -34,7 +34,7 @@ from pydantic import Field, field_validator
 from neurosim_core.clock import to_ns
 from neurosim_core.frames import Vector3
 from neurosim_core.random import normal2, random_bits, stream_id
-from neurosim_core.settings import Settings
+from neurosim_core.settings import BaseConfig
 from neurosim_core.vehicle.aerodynamics import Airframe
 
 _TICK_COUNT = 2  # ticks of turbulence that are kept for each vehicle: it flies between them
@@ -53,7 +53,7 @@ WindVector = tuple[_Wind, _Wind, _Wind]
 """Velocity of the air [m/s], up to twice a hurricane's: what is faster passes walls between two checks."""
 
 
-class GustConfig(Settings):
+class GustConfig(BaseConfig):
     """A discrete gust that rises and falls as 1 - cos, the same everywhere."""
 
     velocity_m_s: WindVector
@@ -67,7 +67,7 @@ class GustConfig(Settings):
     `rise_s`, as in CS-25.341."""
 
 
-class TurbulenceConfig(Settings):
+class TurbulenceConfig(BaseConfig):
     """Dryden turbulence at low altitude (10 to 1000 ft)."""
 
     wind_20ft_m_s: Annotated[float, Field(gt=0.0, le=100.0)]
