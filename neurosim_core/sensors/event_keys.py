@@ -26,7 +26,7 @@ from neurosim_core.runtime.cuda import (
 from neurosim_core.sensors import event_kernels
 from neurosim_core.sensors.event_kernels import COLUMN_OFFSETS, COLUMN_TYPES, EVENT_BYTES
 from neurosim_core.sensors.event_levels import SUB_BITS, KeyLayout
-from neurosim_core.sensors.event_readout import Readout
+from neurosim_core.sensors.event_readout import Readout, by_nanosecond
 
 if TYPE_CHECKING:
     from neurosim_core.sensors.event_labels import EventLabels
@@ -163,11 +163,15 @@ class EventKeys:
 
         Times of those that are lost are returned [ns].
         """
-        first, nothing = self._read_count, np.zeros(0, np.int64)
-        if self.count == first and readout.waiting_count == 0:
-            return nothing
-        happened = self.keys.numpy()[first : self.count] if self.count > first else nothing
-        read, lost_ns = readout.read(happened, origin_us=self.origin_us, now_ns=now_ns)
+        first, arrivals = self._read_count, np.zeros(0, np.int64)
+        count = self.count - first
+        if count == 0 and readout.waiting_count == 0:
+            return arrivals
+        if count > 0:
+            self._launch(by_nanosecond, count, [self.keys, first, self._time_shift], [self._spare])
+            self._sort(self._spare, count)
+            arrivals = self._spare[:count].numpy()
+        read, lost_ns = readout.read(arrivals, origin_us=self.origin_us, now_ns=now_ns)
         self.reserve(first + len(read))
         self.count = first + len(read)
         if len(read) > 0:
@@ -198,7 +202,7 @@ class EventKeys:
             self._header.upload()
             header = [self._header.array, self._bounds, window_count]
             self._launch(event_kernels.prepare, room, [*header, self._time_shift], [self.keys])
-            self._sort(room, end_bit)
+            self._sort(self.keys, room, begin_bit=SUB_BITS - 1, end_bit=end_bit)
             outputs = [*columns, self._found]
             self._launch(event_kernels.decode_windows, room, [*header, self.keys, self._layout], outputs)
             self._found_on_host.fetch(0, window_count)
@@ -252,11 +256,12 @@ class EventKeys:
         arguments = [keys, first, count, origin_step_us, self._time_shift, keys_out, first_out]
         self._carry_over.launch(dim, arguments)
 
-    def _sort(self, count: int, end_bit: int) -> None:
+    def _sort(self, keys: wp.array[wp.int64], count: int, **bits: int) -> None:
+        """Sort the first keys of a buffer; a GPU compares a range of `bits` alone."""
         if self._device.is_cpu:
-            self.keys.numpy()[:count].sort()  # ten times as fast as Warp's radix sort on a CPU
+            keys.numpy()[:count].sort()  # ten times as fast as Warp's radix sort on a CPU
             return
-        wp.utils.radix_sort_pairs(self.keys, self._order, count, begin_bit=SUB_BITS - 1, end_bit=end_bit)
+        wp.utils.radix_sort_pairs(keys, self._order, count, **bits)
 
     def _buffer(self, count: int) -> wp.array[wp.int64]:
         """Return a buffer for keys that are to be sorted: the radix sort on CUDA wants twice the room."""

@@ -142,8 +142,8 @@ def _read_events(
 ) -> None:
     """Read events one by one; the time at which each will be read is known when it comes.
 
-    `arrivals` are keys of `by_nanosecond`, with their origin from the reset [ns]; of lost events the time is
-    noted, from the keys' origin [ns].
+    `arrivals` are sorted keys of `by_nanosecond`, with their origin from the reset [ns]; of lost events the
+    time is noted, from the keys' origin [ns].
     """
     free = bus.free[0]
     read = wp.int32(0)
@@ -249,12 +249,22 @@ def _read_rows(
     _serve(bus, (now_ns << _TICK_BITS) + _ONE, origin_ns, keys_out, counters)
 
 
-def by_nanosecond(keys: NDArray[np.int64], time_shift: int) -> NDArray[np.int64]:
-    """Return keys in the order of nanoseconds, as other bits: time [us] | ns | row | col | polarity."""
-    sub_shift = SUB_BITS - 1
-    place = (keys & ((1 << (time_shift - 1)) - 1)) >> sub_shift  # without `late`
-    time = (keys >> time_shift << time_shift) | ((keys & 1023) << (time_shift - 1 - sub_shift))
-    return np.sort(time | place)
+@wp.kernel
+def by_nanosecond(
+    # In:
+    keys: wp.array[wp.int64],
+    first: wp.int32,
+    time_shift: wp.int32,
+    # Out:
+    keys_out: wp.array[wp.int64],
+) -> None:
+    """Write keys that sort by the nanosecond: time [us] | nanoseconds | row | col | polarity."""
+    event = wp.tid()
+    key = keys[first + event]
+    low_bits = (_ONE << wp.int64(time_shift - 1)) - _ONE  # without `late`
+    place = (key & low_bits) >> _SUB_SHIFT
+    time = (key >> wp.int64(time_shift)) << wp.int64(time_shift)
+    keys_out[event] = time | ((key & _SUB_MASK) << (wp.int64(time_shift - 1) - _SUB_SHIFT)) | place
 
 
 class Readout:
@@ -320,19 +330,18 @@ class Readout:
         self.waiting_count = 0
 
     def read(
-        self, keys: NDArray[np.int64], *, origin_us: int, now_ns: int
+        self, arrivals: NDArray[np.int64], *, origin_us: int, now_ns: int
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the keys of events that are read, and when events that are lost had happened [ns].
 
         Args:
-            keys: Those of events that have happened since the last call, in any order.
+            arrivals: Sorted keys of `by_nanosecond`, of events that have happened since the last call.
             origin_us: Origin of the time of keys [us].
             now_ns: All events until then have happened [ns].
         """
-        count, origin_ns = len(keys), origin_us * NS_PER_US
+        count, origin_ns = len(arrivals), origin_us * NS_PER_US
         read, lost_ns = np.empty(count + self.waiting_count, np.int64), np.empty(count, np.int64)
         now = [now_ns - self._reset_ns] if self._rowwise else []
-        arrivals = by_nanosecond(keys, self._layout.time_shift)
         wp.launch(
             _read_rows if self._rowwise else _read_events,
             dim=1,
