@@ -6,45 +6,25 @@ installed package registers through an entry point of the group `neurosim.plugin
 
 from __future__ import annotations
 
+import importlib
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from rotorpy.vehicles.multirotor import Multirotor
 
 import neurosim_core as ns
 
 _NAMES = dict(zip(ns.vehicle.MultirotorState._fields, ("x", "v", "q", "w", "rotor_speeds"), strict=True))
 
 
-def rotorpy_parameters(config: ns.MultirotorConfig) -> dict[str, Any]:
-    """Return the parameters of an airframe under RotorPy's names."""
-    inertia = np.array(config.inertia_kg_m2)
-    return {
-        "mass": config.mass_kg,
-        **{f"I{'xyz'[i]}{'xyz'[j]}": inertia[i, j] for i in range(3) for j in range(i, 3)},
-        **{f"c_D{axis}": drag for axis, drag in zip("xyz", config.parasitic_drag_kg_m, strict=True)},
-        "num_rotors": config.rotor_count,
-        "rotor_pos": {f"r{k + 1}": np.array(hub) for k, hub in enumerate(config.rotor_position_m)},
-        "rotor_directions": np.array(config.rotor_direction),
-        "rotor_speed_min": config.rotor_speed_min_rad_s,
-        "rotor_speed_max": config.rotor_speed_max_rad_s,
-        "k_eta": config.thrust_coefficient_n_s2,
-        "k_m": config.torque_coefficient_n_m_s2,
-        "k_d": config.rotor_drag_kg,
-        "k_z": config.rotor_inflow_kg,
-        "k_h": config.translational_lift_kg_m,
-        "k_flap": config.flapping_kg_m,
-        "tau_m": config.motor_time_constant_s,
-    }
-
-
 @ns.register("vehicle", "rotorpy")
 class RotorPyVehicleConfig(ns.vehicle.VehicleConfig):
-    """RotorPy's multirotor, with the parameters of one of our airframes."""
+    """RotorPy's multirotor, with its own parameters of an airframe."""
 
     kind: Literal["rotorpy"] = "rotorpy"
     preset: str = "hummingbird"
-    """Name of the airframe."""
+    """Name of the airframe: hummingbird, or crazyflie, whose parameters in RotorPy differ from ours."""
 
     def airframe(self) -> ns.MultirotorConfig:
         """Return the multirotor that controllers assume."""
@@ -52,26 +32,23 @@ class RotorPyVehicleConfig(ns.vehicle.VehicleConfig):
 
     def make(self, context: ns.vehicle.VehicleContext) -> RotorPyVehicle:
         """Return the vehicles of all worlds."""
-        return RotorPyVehicle(self.airframe(), context)
+        return RotorPyVehicle(self.preset, context)
 
 
 class RotorPyVehicle(ns.vehicle.HostVehicle):
     """Integrates with RotorPy, one vehicle after the other."""
 
-    def __init__(self, config: ns.MultirotorConfig, context: ns.vehicle.VehicleContext) -> None:
-        super().__init__(config, context)
-        from rotorpy.vehicles.multirotor import Multirotor
-
-        self._vehicle = Multirotor(rotorpy_parameters(config))
+    def __init__(self, airframe: str, context: ns.vehicle.VehicleContext) -> None:
+        super().__init__(ns.preset(airframe), context)
+        parameters = importlib.import_module(f"rotorpy.vehicles.{airframe}_params")
+        self._vehicle = Multirotor(parameters.quad_params)
 
     def move(
         self, state: ns.vehicle.MultirotorState, command: NDArray[np.float64], duration_s: float
     ) -> ns.vehicle.MultirotorState:
         """Let RotorPy integrate."""
         later = self._vehicle.step(self._told(state), {"cmd_motor_speeds": command}, duration_s)
-        return ns.vehicle.MultirotorState(
-            *(later[_NAMES[name]] for name in ns.vehicle.MultirotorState._fields)
-        )
+        return ns.vehicle.MultirotorState(*(later[name] for name in _NAMES.values()))
 
     def acceleration(
         self, state: ns.vehicle.MultirotorState, command: NDArray[np.float64]
