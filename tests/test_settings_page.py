@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,10 @@ import neurosim_core as ns
 
 def test_it_has_every_sensor_and_scene_and_a_remark_on_each_key():
     pytest.importorskip("mkdocs", reason="needs the extra docs", exc_type=ImportError)
-    page = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "pages.py"))["settings_page"]()
+    path = Path(__file__).parents[1] / "docs" / "pages.py"
+    code = f"import runpy; print(runpy.run_path({str(path)!r})['settings_page']())"
+    # in a process of its own, where no test has registered kinds
+    page = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
     for kind in ("apartment", "hall", "mesh"):
         assert f"## `scene`, kind `{kind}`" in page
     sensors = ns.registry.kinds("sensor").items()
