@@ -65,6 +65,7 @@ class Disk:
         self._error: OSError | None = None
         self.taken_bytes = 0
         """Size of the data that the disk has taken so far [bytes]."""
+        self.is_writing = False
         self._is_ours = True
         self._offset = 0
         self._sealed_size = 0
@@ -147,9 +148,11 @@ class Disk:
 
     def _write(self, offset: int, data: memoryview) -> None:
         while self._error is None and self._is_ours and len(data):
+            self.is_writing = True
             try:
                 written = os.pwrite(self._file.fileno(), data, offset)
                 self.taken_bytes += written
                 offset, data = offset + written, data[written:]
             except OSError as error:
                 self._error = error
+            self.is_writing = False

@@ -145,6 +145,8 @@ class RecordingWriter:
         self._root_camera = cameras[0] if cameras else None
         # A daemon, which works until the interpreter has called all its exit handlers.
         threading.Thread(target=self._write_flushes, name="recording", daemon=True).start()
+        self._is_released = threading.Event()
+        threading.Thread(target=self._watch_disk, name="disk", daemon=True).start()
         self._is_exiting = False
         atexit.register(self._close_at_exit)
         disown_when_forked(self)
@@ -230,6 +232,7 @@ class RecordingWriter:
 
     def _release(self) -> None:
         atexit.unregister(self._close_at_exit)
+        self._is_released.set()
         self._flushes.put(None)
         self._pool.shutdown()
         self._file.close()
@@ -266,18 +269,28 @@ class RecordingWriter:
         """Wait for the flush that is under way, and raise what went wrong."""
         taken_bytes = self._disk.taken_bytes
         while not self._is_idle.wait(_QUIET_S):
-            if self._disk.taken_bytes == taken_bytes:
-                left = f"{1e-6 * self.pending_bytes:.1f} MB wait for it"
-                kept = f"the file is kept up to {self.kept_ns / NS_PER_S:.3f} s"
-                log.warning("%s: the disk took nothing for %g s; %s; %s", self._path, _QUIET_S, left, kept)
-                if self._is_exiting:
-                    sys.stdout.flush()
-                    os._exit(1)
+            if self._is_exiting and self._disk.taken_bytes == taken_bytes:
+                self._say_that_it_waits()
+                sys.stdout.flush()
+                os._exit(1)
             taken_bytes = self._disk.taken_bytes
         self._flushing_bytes = 0
         if self._failure is not None:
             self._is_told = True
             raise self._failure
+
+    def _watch_disk(self) -> None:
+        """Say when a write hangs, in whichever thread."""
+        taken_bytes = -1
+        while not self._is_released.wait(_QUIET_S):
+            if self._disk.is_writing and self._disk.taken_bytes == taken_bytes:
+                self._say_that_it_waits()
+            taken_bytes = self._disk.taken_bytes
+
+    def _say_that_it_waits(self) -> None:
+        left = f"{1e-6 * self.pending_bytes:.1f} MB wait for it"
+        kept = f"the file is kept up to {self.kept_ns / NS_PER_S:.3f} s"
+        log.warning("%s: the disk took nothing for %g s; %s; %s", self._path, _QUIET_S, left, kept)
 
     def _write_flushes(self) -> None:
         while (flush := self._flushes.get()) is not None:
