@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neurosim_core.data.arguments import names_arguments
 from neurosim_core.data.batch import Batch, Sample, collate
 from neurosim_core.data.flights import RecordedFlight
 from neurosim_core.data.shards import ShardFlight
@@ -49,6 +50,7 @@ class Dataset:
         FileNotFoundError: There is no such file.
     """
 
+    @names_arguments
     def __init__(
         self,
         source: str | Path | Sequence[str | Path],
@@ -163,6 +165,7 @@ class Stream:
         ValueError: An argument is out of range, or goes with recordings only.
     """
 
+    @names_arguments
     def __init__(
         self,
         source: Any,
