@@ -60,11 +60,15 @@ class PlanningProcess:
             raise NotPlannedError from None
         return dataclasses.replace(unseeded, seed_m=seed_m, notes=notes), paths
 
+    def close(self) -> None:
+        """End the process; doing it again does nothing."""
+        end_child(self._process)
+
     def __enter__(self) -> PlanningProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
-        end_child(self._process)
+        self.close()
 
 
 def main() -> None:

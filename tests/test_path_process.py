@@ -60,5 +60,7 @@ def test_why_there_is_no_path_is_said_here(tmp_path):
 
 def test_other_paths_are_planned_here(tmp_path):
     settings = settings_in(tmp_path) | {"path": {"kind": "hover", "position_m": [0.5, 0.5, 1.0]}}
-    path = model_by_processes(settings).path
+    with PlanningProcess() as planner, SceneReader(settings, planner=planner) as reader:
+        path = make_model(ns.load_config(settings), reader=reader).path
+        assert planner._process.poll() is not None  # it does not stay as long as the flight
     np.testing.assert_array_equal(path.evaluate([0]).position, [[0.5, 0.5, 1.0]])

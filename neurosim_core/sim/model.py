@@ -255,6 +255,7 @@ def _plan_there(
     """
     flights = [(config.path, config.duration_s) for config in members.values()]
     if not all(isinstance(path, CollisionFreeConfig) for path, _ in flights):
+        planner.close()  # or it would stay, with its libraries, as long as the flight
         raise NotPlannedError
     for config in members.values():
         check_thrust(config.path, config.vehicle.airframe())
