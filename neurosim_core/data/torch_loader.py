@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import pickle
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from neurosim_core.data.arguments import refuse_unknown
 from neurosim_core.data.batch import Batch
 from neurosim_core.data.stream import Position, Stream
 from neurosim_core.install import need
@@ -56,6 +58,8 @@ class Loader:
         **options: Any,
     ) -> None:
         torch = _import_torch()
+        known = [name for name in inspect.signature(Stream).parameters if name not in ("source", "transform")]
+        refuse_unknown("Loader", options, ["workers", *known])
         self.stream = Stream(source, transform=transform, **options)
         self._device = device
         self._position = Position(0, 0)

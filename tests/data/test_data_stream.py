@@ -110,6 +110,12 @@ def test_a_loader_gives_what_the_stream_gives(folder):
     assert np.array_equal(next(iter(resumed))[0].numpy(), expected[1][4][0])
 
 
+def test_unknown_arguments_of_a_loader_are_answered_by_it(folder):
+    pytest.importorskip("torch")
+    with pytest.raises(TypeError, match="Loader has no argument 'worker'; did you mean 'workers'"):
+        data.Loader(folder, worker=2)
+
+
 def test_whole_batches_as_tensors(folder):
     torch = pytest.importorskip("torch")
     batch = next(iter(data.Loader(folder, batch=4)))
