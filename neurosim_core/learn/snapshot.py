@@ -10,11 +10,11 @@ import torch
 import warp as wp
 
 from neurosim_core.learn.task import Task
+from neurosim_core.runtime.cuda import RecordedLaunch
 
 _LEFT_OUT = {  # what never changes, what each step writes before it reads it, and what is of this process
     "_scenes", "_model", "_routes", "_timetable", "_observations", "observation", "_status", "buffers",
-    "slots", "graphs", "results", "stack", "pictures", "shared_pictures", "_pose_launches", "_record",
-    "_flights", "_offsets_ns", "_hosts",
+    "slots", "graphs", "results", "stack", "pictures", "shared_pictures", "_offsets_ns", "_hosts",
 }  # fmt: skip
 
 Place = tuple[str, Any, str, Any]
@@ -73,7 +73,9 @@ def find_state(owner: Any, path: str = "", seen: set[Any] | None = None) -> Iter
 
 
 def _is_own(value: Any) -> bool:
-    """Objects of the simulator, and structures of kernels."""
+    """Objects of the simulator, but launches, which name arrays of others; and structures of kernels."""
+    if isinstance(value, RecordedLaunch):
+        return False
     module = type(value).__module__
     return hasattr(value, "__dict__") and (module.startswith("neurosim_core.") or hasattr(value, "_ctype"))
 

@@ -204,7 +204,7 @@ def test_a_range_of_one_value_is_drawn_too(make):
     assert (env.parameters["focal_factor"] == np.float32(1.2)).all()
     found = draw_lenses(env.task.camera, env.randomisation)[0][0]
     assert found.intrinsics().fx == pytest.approx(1.2 * 8.0 / np.tan(0.75))
-    assert env.sim._state.groups[0].lens_of_world.numpy().any()
+    assert env.sim.optics(CAMERA)[2].numpy().any()
     np.testing.assert_allclose(env.sim.light("dark_floor").numpy(), 1e-2, rtol=1e-5)
 
 
