@@ -61,7 +61,7 @@ static PyObject *cast_add(Broadcast *cast, PyObject *arguments) {
     int strict;
     unsigned int timeout_ms;
     unsigned long long first;
-    if (!PyArg_ParseTuple(arguments, "iiipIK:add", &hello.socket, &hello.page, &hello.bell, &strict, &timeout_ms, &first)
+    if (!PyArg_ParseTuple(arguments, "iiipIK:add", &hello.socket, &hello.page, &hello.wakeup, &strict, &timeout_ms, &first)
         || !cast_is_open(cast))
         return NULL;
     const int member = cortex_writer_add(&cast->writer, &hello, strict, timeout_ms, first);
@@ -410,13 +410,13 @@ static PyObject *hear(PyObject *module, PyObject *socket) {
     const int fd = (int)PyLong_AsLong(socket);
     if (fd == -1 && PyErr_Occurred()) return NULL;
     if (cortex_hear(fd, &hello) < 0) return PyErr_SetFromErrno(PyExc_OSError);
-    return Py_BuildValue("KKii", (unsigned long long)hello.source, (unsigned long long)hello.reader, hello.page, hello.bell);
+    return Py_BuildValue("KKii", (unsigned long long)hello.source, (unsigned long long)hello.reader, hello.page, hello.wakeup);
 }
 
 static PyMethodDef functions[] = {
     {"listen", listen_at, METH_O, "Listen at a path for readers; the descriptor."},
     {"accept", accept_one, METH_O, "The descriptor of a connection, -1 if there is none."},
-    {"hear", hear, METH_O, "Source, number, page and bell of who has connected; BlockingIOError: nothing said yet."},
+    {"hear", hear, METH_O, "Source, number, page and wakeup of who has connected; BlockingIOError: nothing said yet."},
     {NULL, NULL, 0, NULL},
 };
 

@@ -269,9 +269,9 @@ class RingImpostor(Impostor):
 
     def take_in(self, key: bytes, *, answers: bool = True) -> None:
         fd = native.accept(self.listener)
-        source, number, page, bell = native.hear(fd)
+        source, number, page, wakeup = native.hear(fd)
         assert (source, number) == (self.SOURCE, int.from_bytes(key[16:24], "little"))
-        self.ring.add(fd, page, bell, False, 0, 0)
+        self.ring.add(fd, page, wakeup, False, 0, 0)
         if answers:
             self.xpub.send(wire.answer_frame(key, wire.AttachAnswer(0, b"")))
 

@@ -66,7 +66,7 @@ typedef struct {
 typedef struct {
     uint64_t tail; /* all below this has been read */
     uint64_t unused[7];
-    uint32_t sleeping; /* whoever writes next takes this back and rings the bell */
+    uint32_t sleeping; /* whoever writes next takes this back and signals the wakeup */
     uint32_t unused_too[15];
     uint64_t generation; /* of the ring to whose slots the leases belong */
     uint64_t unused_three[111];
@@ -84,7 +84,7 @@ typedef struct {
 typedef struct {
     int used, strict, late;
     int left; /* it reads no more, but looks at slots still */
-    int socket, bell;
+    int socket, wakeup;
     CortexPage *page;
     uint64_t tail; /* as last seen */
     uint64_t late_until;
@@ -129,7 +129,7 @@ typedef struct {
     uint64_t capacity, source, tail;
     uint64_t seen;  /* the head when it was looked at last */
     uint64_t first; /* sequence of the first message that is sent to it */
-    int socket, bell;
+    int socket, wakeup;
     int armed;
     int state; /* CORTEX_BROKEN: it carries something that is no frame; CORTEX_ENDED: more comes through another way only */
 } CortexReader;
@@ -151,10 +151,10 @@ typedef struct {
 
 typedef struct {
     uint64_t source, reader;
-    int socket, page, bell;
+    int socket, page, wakeup;
 } CortexHello;
 
-/* Processes: memory, sockets, bells. Each returns -1 with errno set if it fails, and where there is no memfd. */
+/* Processes: memory, sockets, wakeups. Each returns -1 with errno set if it fails, and where there is no memfd. */
 
 static inline int cortex_writer_open(CortexWriter *writer, uint64_t source, uint64_t capacity);
 static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint32_t timeout_ms, uint64_t first); /* owns the hello */
@@ -174,8 +174,8 @@ static inline void cortex_seat_end(CortexSeat *seat);
 static inline int cortex_process(void);
 static inline void cortex_yield(void);
 static inline int cortex_is_gone(int socket); /* whether the other end is closed */
-static inline void cortex_ring_bell(int bell);
-static inline void cortex_hush_bell(int bell);
+static inline void cortex_signal_wakeup(int wakeup);
+static inline void cortex_clear_wakeup(int wakeup);
 
 /* As memcpy, but large arrays need not be read into the caches to be written over: a third less traffic. The C library does this,
    too, from a size on that it takes from the processor, which on virtual machines is often ten times too large. */
@@ -275,7 +275,7 @@ static inline void cortex_writer_wake(CortexWriter *writer) {
     for (int index = 0; index < writer->count; ++index) {
         CortexMember *member = &writer->members[index];
         if (!member->used || member->left || !__atomic_load_n(&member->page->sleeping, __ATOMIC_RELAXED)) continue;
-        if (__atomic_exchange_n(&member->page->sleeping, 0, __ATOMIC_ACQ_REL)) cortex_ring_bell(member->bell);
+        if (__atomic_exchange_n(&member->page->sleeping, 0, __ATOMIC_ACQ_REL)) cortex_signal_wakeup(member->wakeup);
     }
 }
 

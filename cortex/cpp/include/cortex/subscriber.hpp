@@ -171,7 +171,7 @@ class SubscriptionCore {
         fds.push_back({waker_.fd(), POLLIN, 0});
         for (const auto& link : links_) {
           fds.push_back({link->fd(), POLLIN, 0});
-          if (link->bell_fd() >= 0) fds.push_back({link->bell_fd(), POLLIN, 0});
+          if (link->wakeup_fd() >= 0) fds.push_back({link->wakeup_fd(), POLLIN, 0});
         }
       }
       const std::int64_t now_ns = monotonic_ns();
