@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
+from allocations import allocations
 from core_counts import cores
 from world_rig import RIG, UNSHADOWED, assert_same, commands_of, fly_alone, room, scene_of, settings, snapshot
 
@@ -467,16 +468,7 @@ def test_a_step_allocates_nothing(plain):
     commands = commands_of("rates", 8, 2)
     for command in commands[:4]:
         worlds.step(command)
-    made = []
-    original = wp.array.__init__
-
-    def counted(self: Any, *args: Any, **kwargs: Any) -> None:
-        if kwargs.get("ptr") is None:
-            made.append(kwargs)
-        original(self, *args, **kwargs)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(wp.array, "__init__", counted)
+    with allocations() as made:
         for command in commands[4:]:
             worlds.step(command)
     assert made == []
