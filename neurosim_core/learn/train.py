@@ -52,28 +52,28 @@ _SEEDS_APART = 1 << 20
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """What is trained, and how."""
+    """Task and algorithm of a training."""
 
     task: str
     device: str = "auto"
     seed: int = 0
     teacher: PpoConfig = dataclasses.field(default_factory=PpoConfig)
     student: DaggerConfig | RecurrentPpoConfig = dataclasses.field(default_factory=DaggerConfig)
-    """Imitates the teacher, or learns by PPO from scratch: then there is no teacher."""
+    """Imitates the teacher, or learns by PPO from scratch, without a teacher."""
     pixels: int | None = None
-    """Width and height of the event camera [px]; None: as the task says."""
+    """Width and height of the event camera [px]; None: those of the task."""
     rate_hz: float | None = None
-    """Steps a second; time constants of surfaces are stretched with the step. None: as the task says."""
+    """Steps per second [Hz]; time constants of surfaces scale with the step. None: that of the task."""
     surface: str | None = None
-    """Kind of the event surfaces (`surfaces.SURFACES`); None: as the task says."""
+    """Kind of the event surfaces (`surfaces.SURFACES`); None: that of the task."""
     randomise: str = "training"
-    """What episodes draw: as `Task.training` says (`training`), as tests do (`tests`): what few steps can
-    learn, or nothing (`none`)."""
+    """Randomisation of episodes. `training`: as `Task.training` says; `tests`: so little that few steps can
+    learn it; `none`: nothing is drawn."""
     block: int = _BLOCK
     """Iterations from one checkpoint to the next."""
     evaluation_worlds: int = 96
     wandb: bool = False
-    """Send what TensorBoard gets to Weights & Biases, too (package `wandb`)."""
+    """Whether Weights & Biases gets what TensorBoard gets (package `wandb`)."""
 
     def __post_init__(self) -> None:
         if self.randomise not in _RANDOMISE:
