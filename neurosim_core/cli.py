@@ -401,10 +401,10 @@ def _view(arguments: argparse.Namespace) -> int:
     from neurosim_core.flight import rerun_file
 
     if arguments.save is not None and arguments.save.suffix != ".rrd":
-        from neurosim_core.view.film import save_film
+        from neurosim_core.view.animation import save_animation
 
         flight = arguments.flight
-        save_film(flight / "flight.h5" if flight.is_dir() else flight, arguments.save)
+        save_animation(flight / "flight.h5" if flight.is_dir() else flight, arguments.save)
         print(f"wrote {arguments.save}")
         return 0
     file = rerun_file(arguments.flight, save=arguments.save)

@@ -106,14 +106,14 @@ def _convert(arguments: argparse.Namespace) -> int:
 
 def _check_options(arguments: argparse.Namespace, *, is_events: bool) -> None:
     """Refuse options that do nothing with what is converted."""
-    films = {name: _setting(name) for name in _OPTIONS if name not in ("size", "time-unit")}
+    videos = {name: _setting(name) for name in _OPTIONS if name not in ("size", "time-unit")}
     events = {"to": "out_format", "sensor": "sensor", "from-zero": "from_zero"}
-    others = films | {"set": "settings"} if is_events else events
+    others = videos | {"set": "settings"} if is_events else events
     values = {name: getattr(arguments, key) for name, key in others.items()}
     if given := [
         f"--{name}" for name, value in values.items() if value or (value == 0 and value is not False)
     ]:
-        kind = "a film, and this is a file of events" if is_events else "a file of events, and this is none"
+        kind = "a video, and this is a file of events" if is_events else "a file of events, and this is none"
         raise ValueError(f"{', '.join(given)}: for {kind}: {arguments.source}")
 
 

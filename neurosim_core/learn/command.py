@@ -311,19 +311,19 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
     speed = "" if arguments.speed is None else f"-{arguments.speed:g}m_s"
     run = _run_of(arguments)
-    film = run / f"{Path(arguments.scenes).stem}{speed}.webp"
+    animation = run / f"{Path(arguments.scenes).stem}{speed}.webp"
     for name, evaluation in evaluate_run(
         run,
         scenes=arguments.scenes,
         device=arguments.device,
         worlds=arguments.worlds,
         speed_m_s=arguments.speed,
-        film=film,
+        animation=animation,
     ):
         print(f"{arguments.scenes} scenes, {name}: {evaluation}")
         if not arguments.blind:
             break
-    print(f"wrote {film}: the first of the episodes")
+    print(f"wrote {animation}: the first of the episodes")
     return 0
 
 

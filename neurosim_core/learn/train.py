@@ -27,8 +27,8 @@ from neurosim_core.learn.env import Env, find_task, make_env
 from neurosim_core.learn.evaluate import (
     Evaluation,
     evaluate_policy,
-    film_episode,
-    film_sensors,
+    record_episode,
+    recording_sensors,
     student_actor,
     teacher_actor,
 )
@@ -347,7 +347,7 @@ def evaluate_run(
     device: str | None = None,
     worlds: int | None = None,
     speed_m_s: float | None = None,
-    film: Path | None = None,
+    animation: Path | None = None,
 ) -> Iterator[tuple[str, Evaluation]]:
     """Yield how the student of a run does: first with events (`events`), then without (`blind`).
 
@@ -357,7 +357,7 @@ def evaluate_run(
         device: None: as in the training.
         worlds: Episodes; None: as configured.
         speed_m_s: At which all episodes begin [m/s]; None: as the task says.
-        film: Where to leave a film of the first episode, with events (.webp, .gif); None: none is made.
+        animation: Where to write an animation of the first episode (.webp, .gif); None: none is made.
     """
     config = read_config(folder)
 
@@ -370,9 +370,9 @@ def evaluate_run(
     where: Any = scenes if scenes in ("seen", "unseen") else [scenes]
     env = make(worlds=worlds or config.evaluation_worlds, scenes=where)
     policy = load_student(folder, env.device)
-    if film is not None:
-        filmed = make(worlds=1, models=env.sim.models[:1], sensors=film_sensors(env.task))
-        film_episode(filmed, student_actor(policy, filmed), film)
+    if animation is not None:
+        recorded = make(worlds=1, models=env.sim.models[:1], sensors=recording_sensors(env.task))
+        record_episode(recorded, student_actor(policy, recorded), animation)
     for blind in (False, True):
         actor = student_actor(policy, env, blind=blind)
         yield "blind" if blind else "events", evaluate_policy(env, actor)
@@ -411,7 +411,7 @@ def train(
         say(f"teacher: {training.evaluate_teacher()}")
     export_onnx(training.student, make_card(training.env, training.config.task), folder / "policy.onnx")
     found = {}
-    for name, evaluation in evaluate_run(folder, film=folder / "evaluation.webp"):
+    for name, evaluation in evaluate_run(folder, animation=folder / "evaluation.webp"):
         say(f"student, unseen scenes, {name}: {evaluation}")
         found[name] = evaluation
     values = {name: dataclasses.asdict(evaluation) for name, evaluation in found.items()}
