@@ -69,7 +69,7 @@ class CortexSink:
             publisher.publish(self._to_message(packet, frame_id=frame_id))
 
     def close(self, *, complete: bool = True) -> None:
-        """Deliver what is on its way, and close the topics."""
+        """Deliver what is in flight, and close the topics."""
         for publisher, _ in self._publishers.values():
             publisher.close()
         self._node.close()
