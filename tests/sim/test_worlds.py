@@ -133,7 +133,7 @@ def test_pixels_and_lenses_of_their_own(noisy, plain, device):
 
 @pytest.mark.parametrize("form", ["tiles", "blocks", "blocks that leave too much"])
 def test_walks_that_rays_share(textured, monkeypatch, form):
-    """The instants of a tile share a walk through the tree in each world, which changes nothing.
+    """The instants of a tile share a search of the tree in each world, which changes nothing.
 
     Tile by tile, as on a CPU, and as blocks of CUDA do it, which leave pixels to another kernel.
     """
@@ -576,7 +576,7 @@ def test_patterns_that_never_come_again(plain, monkeypatch, caplog):
 
 
 def test_more_than_32_bits_can_count(plain):
-    """Said before anything is allocated: rooms for events, and the lists of shared walks."""
+    """Said before anything is allocated: event buffers, and candidate lists."""
     lens = {"width": 640, "height": 480, "horizontal_fov_rad": 1.5}
     rig = {"front": {**RIG["front"], "lens": lens, "sampling_rate_hz": 100}}
     with pytest.raises(ValueError, match="4096 worlds with room for 614400 events each"):
