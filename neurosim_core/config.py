@@ -108,7 +108,7 @@ class SimulationConfig(BaseConfig):
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of all sensor noise, and of turbulence."""
     device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")] = "auto"
-    """Where to compute: auto (the first CUDA device, else the CPU), cpu, cuda:0, ..."""
+    """Device to compute on: auto (the first CUDA device, else the CPU), cpu, cuda:0, ..."""
     instants_per_launch: Annotated[int, Field(ge=1, le=1024)] = 16
     """Number of consecutive instants (sampling times) of the fastest camera that one launch renders; changes
     speed and memory, not the result."""
@@ -122,7 +122,7 @@ class SimulationConfig(BaseConfig):
     `synthetic`: a test pattern at almost no cost, to benchmark everything else. {kind: remote, topic: ...}: a
     renderer in another process."""
     render: RenderConfig = RenderConfig()
-    """How the scene is lit and rendered."""
+    """Lighting and rendering of the scene."""
     free_space: FreeSpaceConfig = FreeSpaceConfig()
     """The distance map in which paths are planned."""
     vehicle: AnyVehicle = MultirotorVehicleConfig()

@@ -15,7 +15,7 @@ Delay = Annotated[float, Field(ge=0.0, le=5.0)]
 
 
 class LiveConfig(BaseConfig):
-    """How time passes, and what happens when a controller or the machine is too slow."""
+    """Timing of a live run, and the response to a slow controller or machine."""
 
     mode: LiveMode = "streaming"
     """streaming: time passes whether commands arrive or not; each command is held until the next. lockstep:

@@ -13,7 +13,7 @@ TextureFilter = Literal["trilinear", "bilinear", "nearest"]
 
 
 class LightingConfig(BaseConfig):
-    """How surfaces are lit: Lambert, hemispheric ambient, the lights of the scene."""
+    """Lighting: Lambertian surfaces, hemispheric ambient light, the lights of the scene."""
 
     mode: Literal["baked", "unshadowed"] = "baked"
     """`baked`: shadows and ambient occlusion, computed once when the scene is loaded. `unshadowed`: light
@@ -70,7 +70,7 @@ class RenderConfig(BaseConfig):
     of the scene, as cut for baked light, is at most 7; and on a CPU without Embree, where the lens looks
     forward. null: each ray traverses the tree."""
     lighting: LightingConfig = LightingConfig()
-    """How surfaces are lit."""
+    """Lighting of the surfaces."""
     exposure: Literal["auto"] | Annotated[float, Field(gt=0.0)] = "auto"
     """Factor from linear radiance to the linear value 1.0 of an 8-bit picture. `auto`: chosen once from the
     scene. Event cameras do not use it."""
