@@ -84,6 +84,7 @@ class OpticalFlowConfig(CameraConfig, PictureSensorConfig):
     tell, a second ray does; what is thinner than a pixel may be overlooked."""
 
     packet_type = OpticalFlow
+    is_overlay = True
     output: ClassVar[str] = "range"
 
     @property
