@@ -148,7 +148,7 @@ def test_settings_explain_themselves():
         assert above[-1].strip().startswith("#")
         assert any("{" in line for line in above[-3:]), key
     text = to_yaml(load({"preset": "davis346"}), comments=True)
-    assert "# Events a second and pixel in a still scene, in the dark [Hz]." in text
+    assert "# ON events per second of a pixel in a still scene, in the dark [Hz]." in text
 
 
 @pytest.mark.parametrize(

@@ -136,7 +136,7 @@ def test_pixels_and_lenses_of_their_own(noisy, plain, device):
 
 @pytest.mark.parametrize(("by_tile", "limit"), [(True, 256), (False, 256), (False, 2)])
 def test_walks_that_rays_share(textured, by_tile, limit):
-    """The instants of a tile share a walk through the tree in each world, which changes nothing.
+    """The instants of a tile share a search of the tree in each world, which changes nothing.
 
     Tile by tile, as on a CPU, and as blocks of CUDA do it, which leave pixels to another kernel, and with
     short lists more pixels than there is room for.
@@ -574,7 +574,7 @@ def test_that_graphs_are_given_up_is_said_once(plain, monkeypatch, caplog):
 
 
 def test_more_than_32_bits_can_count(plain):
-    """Said before anything is allocated: rooms for events, and the lists of shared walks."""
+    """Said before anything is allocated: event buffers, and candidate lists."""
     lens = {"width": 640, "height": 480, "horizontal_fov_rad": 1.5}
     rig = {"front": {**RIG["front"], "lens": lens, "sampling_rate_hz": 100}}
     with pytest.raises(ValueError, match="4096 worlds with room for 614400 events each"):
