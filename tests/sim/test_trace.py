@@ -171,7 +171,8 @@ def test_one_launch_flies_and_records_what_single_ones_do(device):
         worlds = worlds_of(vehicle.arrays, device, clock_ns=[7, 9])
         trace = Trace(surfaces, worlds, capacity=6, history_length=6)
         if joined:
-            trace.fly(vehicle, 1, 0, 1_000_000, 5, first=True, last=True)
+            assert trace.joins_spans(vehicle)
+            trace.advance(vehicle, 1, 0, 1_000_000, 5, first=True, last=True)
         for step in () if joined else range(5):
             vehicle.advance(1_000_000)
             elapsed_ns = 1_000_000 * (step + 1)

@@ -551,8 +551,7 @@ def test_models_that_were_made_before(plain, textured):
 
 def test_patterns_that_never_come_again(plain, monkeypatch, caplog):
     """What is kept of them is bounded, and that graphs are given up is said once."""
-    monkeypatch.setattr(worlds_module, "PERIOD_COUNT_MAX", 3)
-    monkeypatch.setattr(event_worlds, "_OFFSETS_MAX", 3)
+    monkeypatch.setattr(worlds_module, "STRETCH_COUNT_MAX", 3)
     rig = {
         "front": {**RIG["front"], "sampling_rate_hz": 59.94, "packet_rate_hz": 59.94},
         "imu": {**RIG["imu"], "rate_hz": 333.333},
@@ -562,13 +561,12 @@ def test_patterns_that_never_come_again(plain, monkeypatch, caplog):
     worlds = Simulation(config, worlds=1)
     seen = record(worlds, commands)
     assert len(worlds._observations) <= 3
-    assert worlds._state.groups[0].world_frames["front"].offsets.cache_info().currsize <= 3
     packets = [p for step in fly_alone(config, commands[:, 0]) for p in step]
     found = [p.numpy() for p in packets if isinstance(p, Events)]
     for column, expected in zip(in_order([s[0]["front"] for s in seen]), in_order(found), strict=True):
         np.testing.assert_array_equal(column, expected)
     assert not caplog.records
-    worlds._state.graphs.dropped_count = 1  # as on a CUDA device
+    worlds._state.pipeline.graphs.dropped_count = 1  # as on a CUDA device
     for command in commands[:2]:
         worlds.step(command)
     assert [record.levelname for record in caplog.records] == ["WARNING"]
