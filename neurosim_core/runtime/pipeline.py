@@ -8,7 +8,9 @@ all its launches are one graph, where they may be.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+
+import warp as wp
 
 from neurosim_core.runtime.cuda import Fence, GraphCache, Launches, make_stream, use_stream
 from neurosim_core.runtime.timing import timed
@@ -62,12 +64,12 @@ class Pipeline:
         else:
             self._waiting.append(launches)
 
-    @contextmanager
-    def batch(self, number: int) -> Iterator[None]:
+    def batch(self, number: int) -> AbstractContextManager[None]:
         """Launch all stages of a batch."""
-        if not self._as_one:
-            yield
-            return
+        return self._whole(number) if self._as_one else nullcontext()
+
+    @contextmanager
+    def _whole(self, number: int) -> Iterator[None]:
         self._waiting = []
         try:
             yield
@@ -78,36 +80,32 @@ class Pipeline:
             self._flown[number % self.flown_ahead].set()
             self._done[number % self.in_flight].set()
 
-    @contextmanager
-    def flight(self, number: int) -> Iterator[None]:
+    def flight(self, number: int) -> AbstractContextManager[None]:
         """Launch the flight of a batch."""
-        with timed(self._wall_s, "dynamics and control"), use_stream(self._flight_stream):
-            yield
-            self._end(self._flown[number % self.flown_ahead])
+        end = self._flown[number % self.flown_ahead]
+        return self._stage("dynamics and control", self._flight_stream, None, end)
 
-    @contextmanager
-    def choice(self, number: int) -> Iterator[None]:
+    def choice(self, number: int) -> AbstractContextManager[None]:
         """Find what is rendered of a batch that flies, ahead of the renderers."""
-        with timed(self._wall_s, "choice of renders"), use_stream(self._choice_stream):
-            self._flown[number % self.flown_ahead].wait_on_stream()
-            yield
+        flown = self._flown[number % self.flown_ahead]
+        return self._stage("choice of renders", self._choice_stream, flown, None)
 
-    @contextmanager
-    def renders(self, number: int) -> Iterator[None]:
+    def renders(self, number: int) -> AbstractContextManager[None]:
         """Launch the renders of a batch whose flight was launched."""
-        stream = self._render_streams[number % self.in_flight]
-        with timed(self._wall_s, "render"), use_stream(stream):
-            self._wait(self._flown[number % self.flown_ahead])
-            yield
-            self._end(self._rendered)
+        flown, stream = self._flown[number % self.flown_ahead], self._render_streams[number % self.in_flight]
+        return self._stage("render", stream, flown, self._rendered)
 
-    @contextmanager
-    def scans(self, number: int) -> Iterator[None]:
+    def scans(self, number: int) -> AbstractContextManager[None]:
         """Launch the scans of the frames that were rendered last; that is the end of the batch."""
-        with timed(self._wall_s, "events"), use_stream(self._scan_stream):
-            self._wait(self._rendered)
-            yield
-            self._end(self._done[number % self.in_flight])
+        end = self._done[number % self.in_flight]
+        return self._stage("events", self._scan_stream, self._rendered, end)
+
+    def _stage(
+        self, phase: str, stream: wp.Stream | None, after: Fence | None, end: Fence | None
+    ) -> AbstractContextManager[None]:
+        if self._waiting is not None:  # nothing is launched yet
+            after = end = None
+        return _Stage(self._wall_s, phase, stream, after, end)
 
     def wait_flown(self, number: int) -> None:
         """Wait for the flight of a batch."""
@@ -122,10 +120,34 @@ class Pipeline:
         for done in self._done:
             done.wait()
 
-    def _wait(self, fence: Fence) -> None:
-        if self._waiting is None:
-            fence.wait_on_stream()
 
-    def _end(self, fence: Fence) -> None:
-        if self._waiting is None:
-            fence.set()
+class _Stage(timed):
+    """Launches a block on a stream (None: the current one), behind a fence, and sets another at its end."""
+
+    __slots__ = ("_after", "_end", "_on")
+
+    def __init__(
+        self,
+        wall_s: dict[str, float],
+        phase: str,
+        stream: wp.Stream | None,
+        after: Fence | None,
+        end: Fence | None,
+    ) -> None:
+        super().__init__(wall_s, phase)
+        self._on = None if stream is None else use_stream(stream)
+        self._after, self._end = after, end
+
+    def __enter__(self) -> None:
+        super().__enter__()
+        if self._on is not None:
+            self._on.__enter__()
+        if self._after is not None:
+            self._after.wait_on_stream()
+
+    def __exit__(self, *_: object) -> None:
+        if self._end is not None:
+            self._end.set()
+        if self._on is not None:
+            self._on.__exit__(None, None, None)
+        super().__exit__()
