@@ -219,9 +219,9 @@ class EventFileSinkConfig(SinkConfig):
 
     kind: Literal["event_file"] = "event_file"
     name: Annotated[str, Field(pattern=r"^[^/]+$")]
-    """Its name; the suffix says the format, as for `neurosim convert`: events.raw, events.aedat4, a.mcap."""
+    """File name; the suffix sets the format, as in `neurosim convert`: events.raw, events.aedat4, a.mcap."""
     sensor: str = ""
-    """Which event camera; empty: the first."""
+    """Name of the event camera; empty: the first."""
 
     @field_validator("name")
     @classmethod

@@ -37,18 +37,18 @@ _SKIPPED_MAX = 20
 
 @dataclass(frozen=True, kw_only=True)
 class WindowConfig:
-    """Which windows are cut, and what they have."""
+    """Windows to cut from a stream of events, and their fields."""
 
     window_s: float = 0.05
     """Length of a window, in whole microseconds [s]."""
     stride_s: float | None = None
-    """From one window to the next [s]; None: they follow on each other."""
+    """Time from one window to the next [s]; None: `window_s`."""
     ends: str | None = None
-    """Field at whose packets windows end, whatever their times; None: at multiples of the stride."""
+    """Field whose packets end the windows; None: windows end at multiples of the stride."""
     fields: Sequence[str] | None = None
-    """What to take of `FIELDS`; None: all that a source has."""
+    """Fields to return, of `FIELDS`; None: all that a source has."""
     sensors: Mapping[str, str] = field(default_factory=dict)
-    """Name of the sensor for a field; by default the first that fits."""
+    """Name of the sensor for each field; by default the first that fits."""
 
     def __post_init__(self) -> None:
         for name, value in (("window_s", self.window_s), ("stride_s", self.stride_s)):

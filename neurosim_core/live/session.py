@@ -40,9 +40,9 @@ class ViewOptions:
     only: Sequence[str] | None = None
     """Sensors to show; None: all."""
     event_window_ns: int = 20_000_000
-    """Time in one picture of events [ns]."""
+    """Length of the event window in one picture [ns]."""
     image_rate_hz: float = 15.0
-    """Most images of a sensor a second, by the wall clock [Hz]."""
+    """Largest image rate of a sensor, by the wall clock [Hz]."""
 
 
 class RunTracker:

@@ -458,7 +458,7 @@ class Attacked {
   bool publish(Attempt attempt, std::size_t size) {
     for (int tries = 0; tries < 8; ++tries) {
       const int found = attempt();
-      if (found == CORTEX_WRITTEN || found == CORTEX_LATE) return true;
+      if (found == CORTEX_WRITTEN || found == CORTEX_LAGGING) return true;
       expect(found == CORTEX_FULL, "a message fits");
       reliable_->read_all();
       if (cortex_writer_patience(&writer_, size) >= 0) cortex_writer_give_up(&writer_, size, 1000);

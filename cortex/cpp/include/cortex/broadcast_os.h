@@ -300,7 +300,7 @@ static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hel
     member->used = 1;
     member->strict = strict;
     member->timeout_ms = timeout_ms;
-    member->late = member->left = 0;
+    member->lagging = member->left = 0;
     member->socket = hello->socket;
     member->wakeup = hello->wakeup;
     member->page = (CortexPage *)page;
@@ -345,7 +345,7 @@ static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity, ui
         if (member->used && member->left) cortex_writer_forget(writer, index);
         if (!member->used || cortex_welcome(writer, member->socket, 0) == 0) continue;
         shutdown(member->socket, SHUT_RDWR); /* then it attaches anew */
-        member->late = 1;
+        member->lagging = 1;
     }
     cortex_ring_move(ring, before->data, old_capacity, head); /* the spare bytes have room for it */
     cortex_writer_wake(writer);

@@ -226,7 +226,7 @@ class SubscriptionCore {
   static constexpr std::int64_t spin_ns = 20'000;
   static constexpr std::int64_t gather_ns = 10'000;
   static constexpr std::int64_t tend_ns = 20'000'000;
-  static constexpr std::int64_t leaving_ns = 2'000'000'000;  // for what is still on its way, after all that is there
+  static constexpr std::int64_t leaving_ns = 2'000'000'000;  // for what is still in flight, after all that is there
 
   // Waits until something may have come. To sleep costs the publisher a wake-up, more than the message itself: where
   // the last one was there within `spin_ns`, this looks for the next one for so long. It looks every `gather_ns`, since
