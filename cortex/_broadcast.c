@@ -61,7 +61,7 @@ static PyObject *cast_add(Broadcast *cast, PyObject *arguments) {
     int strict;
     unsigned int timeout_ms;
     unsigned long long first;
-    if (!PyArg_ParseTuple(arguments, "iiipIK:add", &hello.socket, &hello.page, &hello.bell, &strict, &timeout_ms, &first)
+    if (!PyArg_ParseTuple(arguments, "iiipIK:add", &hello.socket, &hello.page, &hello.wakeup, &strict, &timeout_ms, &first)
         || !cast_is_open(cast))
         return NULL;
     const int member = cortex_writer_add(&cast->writer, &hello, strict, timeout_ms, first);
@@ -263,8 +263,8 @@ static PyObject *cast_memory(Broadcast *cast) {
 PyObject *broadcast_acquire(PyObject *object, Py_ssize_t size) {
     if (object == NULL || !Py_IS_TYPE(object, &BroadcastType) || !((Broadcast *)object)->open) return NULL;
     Broadcast *cast = (Broadcast *)object;
-    int late = 0;
-    if ((uint64_t)size > cast->writer.map->slot_bytes || (!cortex_writer_look(&cast->writer, &late) && late)) return NULL;
+    int lagging = 0;
+    if ((uint64_t)size > cast->writer.map->slot_bytes || (!cortex_writer_look(&cast->writer, &lagging) && lagging)) return NULL;
     const int number = cortex_slot_acquire(&cast->writer);
     PyObject *memory = number < 0 ? NULL : cast_memory(cast);
     Slot *slot = memory == NULL ? NULL : (Slot *)SlotType.tp_alloc(&SlotType, 0);
@@ -289,11 +289,11 @@ char *slot_memory(PyObject *object, PyObject *cast, Py_ssize_t *bytes) {
 
 int slot_number(PyObject *slot) { return ((Slot *)slot)->number; }
 
-int broadcast_commit(PyObject *object, const char *frame, int mind) {
+int broadcast_commit(PyObject *object, const char *frame, int all_or_none) {
     Slot *slot = (Slot *)object;
     uint64_t sequence;
     memcpy(&sequence, frame + HEAD_SIZE, sizeof sequence);
-    const int found = cortex_slot_commit(&slot->cast->writer, slot->number, sequence, frame, HEADER_SIZE, mind);
+    const int found = cortex_slot_commit(&slot->cast->writer, slot->number, sequence, frame, HEADER_SIZE, all_or_none);
     if (found != CORTEX_FULL) slot->open = 0;
     return found;
 }
@@ -359,7 +359,7 @@ static PyMethodDef cast_methods[] = {
     {"add", (PyCFunction)cast_add, METH_VARARGS, "Take in a reader by the descriptors of its hello, which become ours; its number."},
     {"remove", (PyCFunction)cast_remove, METH_O, "Forget a reader."},
     {"send", (PyCFunction)(void (*)(void))cast_send, METH_FASTCALL,
-     "Send a frame to all; `again` if a reliable reader has no room, False if one is late and loses it."},
+     "Send a frame to all; `again` if a reliable reader has no room, False if one is lagging and loses it."},
     {"end", (PyCFunction)cast_end, METH_O, "Send the last frame, for which there is room."},
     {"dissolve", (PyCFunction)cast_dissolve, METH_NOARGS, "Send all readers another way, and close it; what is in it stays theirs."},
     {"patience", (PyCFunction)cast_patience, METH_O,
@@ -410,13 +410,13 @@ static PyObject *hear(PyObject *module, PyObject *socket) {
     const int fd = (int)PyLong_AsLong(socket);
     if (fd == -1 && PyErr_Occurred()) return NULL;
     if (cortex_hear(fd, &hello) < 0) return PyErr_SetFromErrno(PyExc_OSError);
-    return Py_BuildValue("KKii", (unsigned long long)hello.source, (unsigned long long)hello.reader, hello.page, hello.bell);
+    return Py_BuildValue("KKii", (unsigned long long)hello.source, (unsigned long long)hello.reader, hello.page, hello.wakeup);
 }
 
 static PyMethodDef functions[] = {
     {"listen", listen_at, METH_O, "Listen at a path for readers; the descriptor."},
     {"accept", accept_one, METH_O, "The descriptor of a connection, -1 if there is none."},
-    {"hear", hear, METH_O, "Source, number, page and bell of who has connected; BlockingIOError: nothing said yet."},
+    {"hear", hear, METH_O, "Source, number, page and wakeup of who has connected; BlockingIOError: nothing said yet."},
     {NULL, NULL, 0, NULL},
 };
 

@@ -5,14 +5,14 @@
 
 #include "_native.h"
 
-/* Send a frame as a call to the `send` of a `Broadcast` would, unless some reader is late: that, too, is CORTEX_FULL. Else
+/* Send a frame as a call to the `send` of a `Broadcast` would, unless some reader is lagging: that, too, is CORTEX_FULL. Else
    CORTEX_WRITTEN, CORTEX_TOO_LARGE, or -1 if `send` is something else. */
 int broadcast_put(PyObject *send, const char *frame, Py_ssize_t size);
 
 /* Whether `send` is that of a `Broadcast` that is open. */
 int broadcast_is_open(PyObject *send);
 
-/* Where a frame of so many bytes may be written for all readers, if `send` is that of a `Broadcast` that nobody is late in and
+/* Where a frame of so many bytes may be written for all readers, if `send` is that of a `Broadcast` that nobody is lagging in and
    that has room; else NULL. `broadcast_finish` sends it. */
 char *broadcast_begin(PyObject *send, Py_ssize_t size);
 void broadcast_finish(PyObject *send, Py_ssize_t size);
@@ -26,7 +26,7 @@ char *slot_memory(PyObject *slot, PyObject *cast, Py_ssize_t *bytes);
 int slot_number(PyObject *slot);
 
 /* Send the header of what was written into such a slot; as `broadcast_put`. */
-int broadcast_commit(PyObject *slot, const char *frame, int mind);
+int broadcast_commit(PyObject *slot, const char *frame, int all_or_none);
 
 /* What keeps the body of the frame that a `RingReader` has taken last, borrowed, and where it is; NULL if the frame names
    no slot. Who has made use of it says so, that it be kept no longer than that. */

@@ -29,7 +29,7 @@ typedef struct {
     uint64_t start, size;
 } Deferred;
 
-/* One message on its way to bytes. */
+/* One message while it is encoded. */
 typedef struct {
     CortexWrite write;
     const char *place; /* where it goes, if arrays may lie there already; NULL: they do not */

@@ -29,7 +29,7 @@ PyDoc_STRVAR(fast_doc,
 "    lock: Held while it reads.\n"
 "    receive_lock: Its `waiting` says how many others want the lock: then there is no waiting.\n"
 "    queue: What has to be taken before; while something is in it, it takes nothing.\n"
-"    counters: Their `received` counts what is taken, their `latency` how long it was on its way.\n"
+"    counters: Their `received` counts what is taken, their `latency` how long it was in flight.\n"
 "    again: What a link's `receive` raises where nothing is there.\n"
 "    accept: Called with the lock held, the link, and a frame that does not simply follow.\n"
 "    nothing: Returned where there is no message.\n");

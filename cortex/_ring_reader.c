@@ -54,7 +54,7 @@ static int keep_body(RingReader *reader, CortexBody *found) {
     return 1;
 }
 
-/* The next frame as bytes; NULL if there is none, perhaps with an error. Then the bell rings when one comes. */
+/* The next frame as bytes; NULL if there is none, perhaps with an error. Then the wakeup is signalled when one comes. */
 static PyObject *next_frame(RingReader *reader) {
     const uint8_t *data;
     int64_t size;
@@ -109,7 +109,7 @@ static PyObject *reader_take_body(RingReader *reader, PyObject *unused) {
     return NULL;
 }
 
-/* As `next_frame`, with the bell armed if there is none. */
+/* As `next_frame`, with the wakeup armed if there is none. */
 static PyObject *next_or_arm(RingReader *reader) {
     while (1) {
         PyObject *frame = next_frame(reader);
@@ -119,9 +119,9 @@ static PyObject *next_or_arm(RingReader *reader) {
     }
 }
 
-/* Wait for the bell or the socket, without the GIL; 0 with an error set. */
+/* Wait for the wakeup or the socket, without the GIL; 0 with an error set. */
 static int reader_wait(RingReader *reader) {
-    struct pollfd sources[2] = {{reader->ring.bell, POLLIN, 0}, {reader->socket_fd, POLLIN, 0}};
+    struct pollfd sources[2] = {{reader->ring.wakeup, POLLIN, 0}, {reader->socket_fd, POLLIN, 0}};
     const int wait_ms = reader->wait_ms;
     Py_BEGIN_ALLOW_THREADS
     poll(sources, 2, wait_ms);
@@ -232,7 +232,7 @@ static PyGetSetDef reader_properties[] = {
 };
 
 static PyMemberDef reader_members[] = {
-    {"fd", T_INT, offsetof(RingReader, ring.bell), READONLY, "Becomes readable when a frame comes after none was there."},
+    {"fd", T_INT, offsetof(RingReader, ring.wakeup), READONLY, "Becomes readable when a frame comes after none was there."},
     {"is_crowded", T_INT, offsetof(RingReader, is_crowded), READONLY, "Whether the next message waits, as too many large ones are kept."},
     {NULL, 0, 0, 0, NULL},
 };

@@ -66,7 +66,7 @@ class Hello(NamedTuple):
     socket: int
     page: int
     wakeup: int
-    """The eventfd that wakes the reader; the bell of WIRE.md."""
+    """The eventfd that wakes the reader."""
 
     def close(self) -> None:
         """Let go of them."""

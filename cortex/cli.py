@@ -99,7 +99,7 @@ class _Version(argparse.Action):
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="cortex",
-        description="Look at, record and replay what Cortex nodes say to each other.",
+        description="Inspect, record and replay the messages of Cortex nodes.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -132,7 +132,7 @@ def _add(
     parser = commands.add_parser(name, aliases=aliases, formatter_class=form, **texts)
     parser.set_defaults(run=run, interrupted=interrupted)
     if network:
-        add = parser.add_argument_group("where to look").add_argument
+        add = parser.add_argument_group("network").add_argument
         add("--domain", type=int, metavar="N", help="0 to 232; default: CORTEX_DOMAIN, else 0")
         add(
             "--registry",
@@ -140,7 +140,7 @@ def _add(
             metavar="ADDRESS",
             help='"auto" (this host), "off", or tcp://host:port; default: CORTEX_REGISTRY, else "auto"',
         )
-        listen = "let other hosts reach us, e.g. 192.168.1.5; default: CORTEX_LISTEN"
+        listen = "address for other hosts, e.g. 192.168.1.5; default: CORTEX_LISTEN"
         add("--listen", metavar="IP", help=listen)
         add("--keys", type=_path, metavar="DIR", help="key directory, for tcp; default: CORTEX_KEYS")
         add("--insecure", action="store_true", help="allow plain tcp beyond this host")
@@ -152,7 +152,7 @@ def _add_looking(commands: Any) -> None:
     what = "list the topics, their types, and who publishes and subscribes"
     _add(commands, "topics", what, ("look", "show_topics"))
     _add(commands, "nodes", "list the nodes", ("look", "show_nodes"))
-    once = "print once and end, instead of every second"
+    once = "print once and exit, instead of every second"
     what, details = "show all topics live: rate, bandwidth, losses, delay", "Losses are counted since each "
     add = _add(commands, "top", what, ("look", "show_top"), details=f"{details}subscriber began.")
     add("--once", action="store_true", help=once)
@@ -169,7 +169,7 @@ def _add_watching(commands: Any) -> None:
         "echo",
         "print the messages of a topic",
         ("watch", "echo"),
-        details="Each begins with its number, its size, and how long it was under way.",
+        details="Each begins with its number, its size and its latency.",
         examples=[
             "cortex echo /scan -n 1",
             "cortex echo /scan --full | less",
@@ -177,20 +177,20 @@ def _add_watching(commands: Any) -> None:
         ],
     )
     add("topic", type=_topic)
-    add("-n", "--count", type=_count, metavar="N", help="end after so many messages")
+    add("-n", "--count", type=_count, metavar="N", help="number of messages after which to exit")
     add("--json", action="store_true", help="one line of JSON for each message, arrays in full")
     arrays = commands.choices["echo"].add_mutually_exclusive_group()
-    arrays.add_argument("--no-arrays", action="store_true", help="of arrays only the type and shape")
-    arrays.add_argument("--full", action="store_true", help="arrays and texts in full, however long")
+    arrays.add_argument("--no-arrays", action="store_true", help="print only type and shape of arrays")
+    arrays.add_argument("--full", action="store_true", help="print arrays and texts in full")
     what = "measure rate, regularity, bandwidth and delay of a topic"
     details = (
-        "Each second a line over those before: the rate; standard deviation and longest of the times between "
-        "two messages, as they were published; bandwidth and mean size; how long messages were under way."
+        "One line a second, over the last --window: rate; standard deviation and maximum of the intervals "
+        "between messages, as they were published; bandwidth and mean size; latency."
     )
     add = _add(commands, "hz", what, ("watch", "show_rate"), details=details, aliases=("bw", "delay"))
     add("topic", type=_topic)
-    add("--window", type=_positive, default=5.0, metavar="S", help="seconds to look back over (5)")
-    add("-n", "--count", type=_count, metavar="N", help="end after so many lines")
+    add("--window", type=_positive, default=5.0, metavar="S", help="length of the window in seconds (5)")
+    add("-n", "--count", type=_count, metavar="N", help="number of lines after which to exit")
     add("--stamp", action="store_true", help="delay from stamp_ns, where that is the time of day, until now")
 
 
@@ -208,11 +208,11 @@ def _add_files(commands: Any) -> None:
     add("-o", "--output", type=Path, required=True, metavar="FILE")
     add("-a", "--all", action="store_true", help="every topic, also those that appear later")
     add("--force", action="store_true", help="overwrite the file if it exists")
-    add("--duration", type=_positive, metavar="S", help="end after so many seconds")
-    best_effort = "never hold up a publisher; rather lose messages, which are counted"
+    add("--duration", type=_positive, metavar="S", help="seconds after which to exit")
+    best_effort = "never block a publisher; lose messages instead, and count them"
     add("--best-effort", action="store_true", help=best_effort)
     kinds = ("none", "lz4", "zstd")
-    add("--compression", choices=kinds, default="none", help="of the file (none, the fastest)")
+    add("--compression", choices=kinds, default="none", help="compression of the file (none, the fastest)")
     add = _add(
         commands,
         "play",
@@ -228,14 +228,14 @@ def _add_files(commands: Any) -> None:
         interrupted=INTERRUPTED,
     )
     add("file", type=Path)
-    add("topic", nargs="*", type=_topic, help="only these")
-    add("--info", action="store_true", help="say what is in the file, and end")
-    rate = 'factor of speed, or "max": without pauses (1)'
+    add("topic", nargs="*", type=_topic, help="topics to play (all)")
+    add("--info", action="store_true", help="print a summary of the file, and exit")
+    rate = 'speed factor, or "max": without pauses (1)'
     add("--rate", type=_rate, default=1.0, metavar="R", help=rate)
-    start = "begin so many seconds into the file"
+    start = "offset into the file in seconds"
     add("--start", type=_not_negative, default=0.0, metavar="S", help=start)
-    add("--duration", type=_positive, metavar="S", help="play so many seconds of the file")
-    add("--loop", action="store_true", help="begin anew at the end")
+    add("--duration", type=_positive, metavar="S", help="seconds of the file to play")
+    add("--loop", action="store_true", help="restart at the end")
     remap = "publish under another name; may be repeated"
     add("--remap", action="append", default=[], metavar="/OLD:=/NEW", help=remap)
 
@@ -243,31 +243,31 @@ def _add_files(commands: Any) -> None:
 def _add_tools(commands: Any) -> None:
     for name, what in (
         ("discovery", "run the registry of a domain, also for other hosts"),
-        ("bench", "measure Cortex beside its peers on this machine"),
+        ("bench", "compare Cortex with other libraries on this machine"),
     ):
         options = f"its options: cortex {name} --help"
         commands.add_parser(name, help=f"{what} ({options})", add_help=False)
     examples = ["cortex keys new", "cortex keys new --dir ./keys"]
-    what = "make a pair of keys for tcp"
+    what = "make a key pair for tcp"
     add = _add(commands, "keys", what, ("tools", "make_keys"), examples=examples, network=False)
     add("action", choices=("new",))
-    add("--dir", type=_path, metavar="DIR", help="where to (cortex in XDG_CONFIG_HOME or ~/.config)")
+    add("--dir", type=_path, metavar="DIR", help="key directory (cortex in XDG_CONFIG_HOME or ~/.config)")
     examples = ["cortex doctor", "cortex doctor --registry tcp://10.0.0.2:7460 --keys ~/.config/cortex"]
-    what = "check what Cortex needs on this host, and say how to mend what is wrong"
+    what = "check what Cortex needs on this host, and tell how to fix problems"
     _add(commands, "doctor", what, ("doctor", "examine"), examples=examples)
     examples = ["cortex schema diff robot:Scan /scan", "cortex schema diff run.mcap:/scan robot:Scan"]
-    what = "say what sets two message types apart, and whether one may read the other"
+    what = "compare two message types, and tell whether one may read the other"
     add = _add(commands, "schema", what, ("tools", "compare"), examples=examples)
     add("action", choices=("diff",))
     for which in ("old", "new"):
-        add(which, help="module:Type, a topic that is published, or FILE.mcap:/topic")
+        add(which, help="module:Type, a published topic, or FILE.mcap:/topic")
     examples = ["cortex cpp cortex.messages:Imu > imu.hpp", "cortex cpp robot:Scan robot:Cmd > robot.hpp"]
     what = "write the C++ header of message types to the standard output"
     add = _add(commands, "cpp", what, ("tools", "write_cpp"), examples=examples, network=False)
-    add("type", nargs="*", metavar="module:Type", help="modules in this directory are found, too")
+    add("type", nargs="*", metavar="module:Type", help="message types, also of modules in this directory")
     add("--namespace", help="C++ namespace of the structs")
-    add("--include-dir", action="store_true", help="print where the headers of Cortex are, and end")
-    headers = "write there what the client includes besides, and end"
+    add("--include-dir", action="store_true", help="print the folder of the headers of Cortex, and exit")
+    headers = "write the headers that the client includes there, and exit"
     add("--headers", type=Path, metavar="DIR", help=headers)
 
 

@@ -301,7 +301,7 @@ class Directory:
 
     def _on_alive(self, alive: records.Alive, now_ns: int) -> None:
         if not self._welcomed or now_ns < self._quiet_ns:
-            return  # the answer to our last `Hello` is on its way and says more
+            return  # the answer to our last `Hello` is in flight and says more
         if alive.epoch != self._epoch or alive.version != self._version or not self._is_complete():
             self._say_hello(now_ns, snapshot=True)
         elif alive.held != self._own.revision:

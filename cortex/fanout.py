@@ -24,7 +24,7 @@ SILENCE_NS = 100_000_000
 FORGET_NS = 10_000_000_000
 """After so long without a message the memory of large bodies that were sent is given back."""
 TELL_AGAIN_S = 0.02
-"""A reader that was late when the publisher is closed is told this often how many messages there were."""
+"""A reader that was lagging when the publisher is closed is told this often how many messages there were."""
 
 
 class Fanout:
@@ -45,8 +45,8 @@ class Fanout:
         self._max_wait_ms = round(max_wait_s * 1000.0)
         self.readers: dict[bytes, Reader] = {}
         self.ring = Broadcast(self, expected_bytes)
-        self.late: dict[PubSocket, int] = {}
-        """Strict sockets on which a reader was too late, and the sequence from which on it may get messages.
+        self.lagging: dict[PubSocket, int] = {}
+        """Strict sockets on which a reader is lagging, and the sequence from which on it may get messages.
 
         libzmq sends it nothing until it has caught up."""
         self.latched = b""
@@ -96,7 +96,7 @@ class Fanout:
             if reader.request.reader == request.reader and reader.pub_socket is pub_socket:
                 del self.readers[key]
                 self.ring.dismiss(reader)
-                self.late.pop(pub_socket, None)
+                self.lagging.pop(pub_socket, None)
                 self.route()
                 return
 
@@ -108,9 +108,9 @@ class Fanout:
                 is_new = not each.has_answer
                 each.confirmed, each.has_answer = max(each.confirmed, sequence), True
         if is_new:
-            return  # it was not the one that was late
-        if sequence >= self.late.get(pub_socket, 0):  # else it was too late once more since
-            self.late.pop(pub_socket, None)
+            return  # it was not the one that was lagging
+        if sequence >= self.lagging.get(pub_socket, 0):  # else it was too late once more since
+            self.lagging.pop(pub_socket, None)
             self.route()
 
     def route(self) -> None:
@@ -122,7 +122,7 @@ class Fanout:
         ]
         self._lossy_sends = tuple(sends)
         self._strict_sockets = tuple(pub_socket for pub_socket in pub_sockets if pub_socket.strict)
-        usual = not (self.latching or self.late or self.ring.has_lost)
+        usual = not (self.latching or self.lagging or self.ring.has_lost)
         retries = {each.send: partial(self.send_strict, each) for each in self._strict_sockets}
         self._retries = retries | self.ring.sends
         self._fast_send.sends = (*self._lossy_sends, *self._retries) if usual else ()
@@ -154,7 +154,7 @@ class Fanout:
         """Send a frame to all, waiting for reliable readers; False if one of them lost it."""
         for send in self._lossy_sends:
             send(frame, DONTWAIT)
-        on_time = not (self.late or self.ring.has_lost)
+        on_time = not (self.lagging or self.ring.has_lost)
         for pub_socket in self._strict_sockets:
             try:
                 pub_socket.send(frame, DONTWAIT)
@@ -175,7 +175,7 @@ class Fanout:
         rest = wire.REST.pack(sequence, stamp_ns, publish_ns, size, 0)
         if self.latching:
             self.latched = self._large_head + rest + body
-        on_time = not (self.late or self.ring.has_lost)
+        on_time = not (self.lagging or self.ring.has_lost)
         for pub_socket in {r.pub_socket for r in self.readers.values() if r.member is None}:
             on_time &= self._send_body(pub_socket, self._large_head + rest, body)
         if slot is not None:
@@ -192,7 +192,7 @@ class Fanout:
         def has_room() -> bool:
             return self.large.has_room(pub_socket, body)
 
-        may_wait = pub_socket.strict and pub_socket not in self.late
+        may_wait = pub_socket.strict and pub_socket not in self.lagging
         if not has_room() and not (may_wait and self.await_room(has_room, self._timeout_s(pub_socket))):
             if may_wait:
                 self._give_up(pub_socket)
@@ -233,7 +233,7 @@ class Fanout:
 
     def _give_up(self, pub_socket: PubSocket) -> None:
         """Wait for the readers of a strict socket no more, until they have found what they lost."""
-        self.late[pub_socket] = self._fast_send.sequence
+        self.lagging[pub_socket] = self._fast_send.sequence
         self.route()
 
     def await_room(self, send: Callable[[], bool], timeout_s: float) -> bool:
@@ -285,10 +285,10 @@ class Fanout:
             Whether each has all of it, or has had its time.
         """
         last = self._news(self._fast_send.sequence)
-        # Libzmq drops it while a reader is late: it is sent now and then, until that one says that it reads.
+        # Libzmq drops it while a reader lags: it is sent now and then, until that one says that it reads.
         if waited_s >= self._tell_again_s:
             self._tell_again_s = waited_s + TELL_AGAIN_S
-            self._untold = [each for each in self._untold if not each.try_send(last) or each in self.late]
+            self._untold = [each for each in self._untold if not each.try_send(last) or each in self.lagging]
             # A lossy socket drops it where a queue is full, and does not say so.
             for pub_socket in {r.pub_socket for r in self.readers.values() if self._owes(r)} - {
                 *self._strict_sockets

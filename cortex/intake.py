@@ -185,7 +185,7 @@ class Intake:
         return received
 
     def leave(self, source: int, until_ns: int) -> bool:
-        """A publisher has left: read what is still on its way until then; False if it is not here."""
+        """A publisher has left: read what is still in flight until then; False if it is not here."""
         left = [link for link in self.links if link.source == source and link not in self.leaving]
         for link in left:
             self.leaving[link] = until_ns
@@ -196,7 +196,7 @@ class Intake:
     def end_overdue(self, now_ns: int) -> list[Link]:
         """End links that have ended or had their time, once a reliable one has all; they are to be closed."""
         overdue = [link for link, until_ns in self.leaving.items() if now_ns >= until_ns or link.has_ended]
-        if overdue and self._policy.reliable:  # what is on its way stays there until there is room for it
+        if overdue and self._policy.reliable:  # what is in flight stays there until there is room for it
             unread = self.drain()
             overdue = [link for link in overdue if link not in unread]
         for link in overdue:

@@ -122,7 +122,7 @@ class Link:
         self._receive_socket = self._frames.receive
         self.receive: Callable[[int], bytes] = self._receive_socket
         self._end: Any = None
-        """Our end of the ring, if we have asked for it; open until the end, as others wait for its bell."""
+        """Our end of the ring, if we have asked for it; open until the end, as others wait for its wakeup."""
         self._ring: Any = None
         """That which brings all messages; None: they come through the socket."""
         try:

@@ -45,7 +45,7 @@ LOOK_EVERY = 64
 """After a look in vain, every so many calls of `look_out` one looks again."""
 BLOCK_S = BLOCK_MS * 1e-3
 LEAVING_NS = 2_000_000_000
-"""How long the connection to a publisher that has left is kept, for what is still on its way."""
+"""How long the connection to a publisher that has left is kept, for what is still in flight."""
 
 
 class Subscriber(Closing, Generic[T]):
@@ -420,7 +420,7 @@ class Subscriber(Closing, Generic[T]):
             return bool(found)
 
     def forget(self, source: int) -> None:
-        """A publisher has left: read what is still on its way, then disconnect; for the node.
+        """A publisher has left: read what is still in flight, then disconnect; for the node.
 
         A reliable subscriber disconnects once it has read all of it, however long its user takes.
         """

@@ -92,13 +92,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--backend",
         metavar="auto|rclpy|dds|BAG.mcap",
-        help="how to reach ROS 2: rclpy, DDS without ROS, or a bag to write; default: rclpy if it is there",
+        help="how to reach ROS 2: rclpy, DDS without ROS, or a bag to write; default: rclpy if installed",
     )
     parser.add_argument(
-        "--distro", help="ROS distribution, such as humble or jazzy; default: ROS_DISTRO, or what is seen"
+        "--distro", help="ROS distribution, such as jazzy; default: ROS_DISTRO, or that of other nodes"
     )
     parser.add_argument(
-        "--namespace", help="goes before all ROS topics but /clock, /tf, /tf_static, /diagnostics"
+        "--namespace", help="prefix of all ROS topics but /clock, /tf, /tf_static, /diagnostics"
     )
     parser.add_argument(
         "--cortex-domain", "--domain", type=int, help="domain of Cortex; that of ROS is ROS_DOMAIN_ID"
@@ -111,9 +111,9 @@ def _parser() -> argparse.ArgumentParser:
         help="convert a bag into a log of Cortex, or a log into a bag, and exit",
     )
     parser.add_argument("--version", action="version", version=f"cortex-ros2-bridge {_version()}")
-    parser.add_argument("--list", action="store_true", help="print which topic would go where, and exit")
+    parser.add_argument("--list", action="store_true", help="print the routes of all topics, and exit")
     parser.add_argument("--print-config", action="store_true", help="print all settings as YAML, and exit")
-    parser.add_argument("--verbose", "-v", action="store_true", help="say when topics are subscribed to, too")
+    parser.add_argument("--verbose", "-v", action="store_true", help="also log subscriptions to topics")
     parser.add_argument(
         "--converter",
         action="append",
@@ -121,7 +121,7 @@ def _parser() -> argparse.ArgumentParser:
         help="import conversions for types of your own; may be repeated",
     )
     parser.add_argument(
-        "--beside", action="store_true", help="run although another bridge publishes the same topics"
+        "--beside", action="store_true", help="run even if another bridge publishes the same topics"
     )
     return parser
 

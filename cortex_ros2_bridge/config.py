@@ -125,7 +125,7 @@ _NO_OTHERS = ConfigDict(extra="forbid")
 
 
 class QosChanges(TypedDict, total=False):
-    """Elements of a quality of service that are different."""
+    """Changed policies of a quality of service."""
 
     __pydantic_config__ = _NO_OTHERS  # type: ignore[misc]
 
@@ -136,18 +136,18 @@ class QosChanges(TypedDict, total=False):
 
 @dataclass(frozen=True, kw_only=True)
 class RouteChange:
-    """One entry of `routes`: what is different for the routes that it fits, or a route of its own."""
+    """One entry of `routes`: changes of the routes that it matches, or a route of its own."""
 
     __pydantic_config__: ClassVar[ConfigDict] = _NO_OTHERS
 
     cortex: TopicPattern
     """Cortex topic, or a pattern with * and ?."""
     type: Annotated[str, AfterValidator(to_ros_type)] | None = None
-    """Only routes of this ROS type; where there is none by default, it is added."""
+    """ROS type of the matched routes; where none has it by default, a route of this type is added."""
     ros: Annotated[str, AfterValidator(_ros_pattern)] | None = None
     """ROS topic instead of the default one; {topic} stands for the Cortex topic."""
     qos: Annotated[QosChanges, BeforeValidator(_named_qos)] = field(default_factory=QosChanges)
-    """Elements of the quality of service that are different."""
+    """Changed policies of the quality of service."""
     options: Annotated[dict[str, Any], AfterValidator(_options)] = field(default_factory=dict)
     """Options of the conversion, see README.md."""
     enabled: StrictBool = True
@@ -163,43 +163,43 @@ class RouteChange:
 
 @dataclass(frozen=True, kw_only=True)
 class BridgeConfig:
-    """What the bridge does."""
+    """Settings of the bridge."""
 
     __pydantic_config__: ClassVar[ConfigDict] = _NO_OTHERS
 
     backend: Annotated[str, AfterValidator(check_kind)] = "auto"
-    """auto, rclpy, dds, or the name of a bag: run.mcap."""
+    """ROS side of the bridge: auto, rclpy, dds, or the name of a bag: run.mcap."""
     distro: Annotated[str, AfterValidator(_distro)] | None = None
-    """ROS distribution, such as jazzy; None: ROS_DISTRO, or what the other nodes show."""
+    """ROS distribution, such as jazzy; None: ROS_DISTRO, or what other nodes show."""
     cortex_domain: Annotated[StrictInt, Field(ge=0)] | None = None
-    """Domain of Cortex; None: CORTEX_DOMAIN. That of ROS is ROS_DOMAIN_ID."""
+    """Cortex domain; None: CORTEX_DOMAIN. The ROS domain is ROS_DOMAIN_ID."""
     node: Annotated[str, AfterValidator(lambda name: check_node_name(name, "")[0])] = "cortex_bridge"
     """Name of the ROS node."""
     namespace: Annotated[str, AfterValidator(_namespace)] = ""
-    """Goes before all ROS topics but /clock, /tf, /tf_static and /diagnostics."""
+    """Prefix of all ROS topics but /clock, /tf, /tf_static and /diagnostics."""
     isolate: StrictBool = False
-    """Whether the namespace goes before these, too, and before the names of frames."""
+    """Whether the namespace is also a prefix of these topics and of the names of frames."""
     frames: Annotated[FrameNames, BeforeValidator(_without_nulls)] = field(default_factory=FrameNames)
     """Names of frames in ROS."""
     autostart: StrictBool = True
-    """Whether it begins active; else ROS configures and activates it, as a managed node."""
+    """Whether the node starts active; false: ROS configures and activates it, as a managed node."""
     defaults: StrictBool = True
-    """Whether topics have routes that no entry of `routes` asks for."""
+    """Whether topics without an entry in `routes` get their default routes."""
     robot: StrictBool = False
-    """Whether a robot in ROS is flown by a controller in Cortex: then its odometry and events come in, its
-    commands go out, and nothing else passes."""
+    """Whether a controller in Cortex flies a robot in ROS: then its odometry and events come in, its commands
+    go out, and nothing else passes."""
     include: tuple[TopicPattern, ...] = ("*",)
-    """Cortex topics that may have routes: patterns with * and ?."""
+    """Cortex topics that may be bridged: patterns with * and ?."""
     exclude: tuple[TopicPattern, ...] = ()
-    """Cortex topics that may not."""
+    """Cortex topics that are not bridged: patterns with * and ?."""
     rename: dict[RosName, RosName] = field(default_factory=dict)
-    """Beginnings of ROS topics to replace: {/drone/rgb: /front} makes /front/image_raw of an image."""
+    """Prefixes of ROS topics to replace: {/drone/rgb: /front} makes /front/image_raw of an image."""
     routes: tuple[Annotated[RouteChange, BeforeValidator(_without_nulls)], ...] = ()
-    """Changes, in order; later ones win."""
+    """Changes of routes, in order; later entries win."""
     converters: tuple[Annotated[str, Field(min_length=1)], ...] = ()
-    """Modules, or .py files, that register conversions."""
+    """Python modules, or .py files, that register conversions."""
     ros: RosArguments = field(default_factory=RosArguments)
-    """What followed `--ros-args`; no setting of the file."""
+    """ROS arguments after `--ros-args`; not a key of the file."""
 
     def __post_init__(self) -> None:
         if self.is_bag and not self.autostart:

@@ -27,16 +27,16 @@ FrameKind = Literal["world", "body", "heading"]
 
 @dataclass(frozen=True, kw_only=True)
 class FrameNames:
-    """What frames are called in ROS."""
+    """Names of frames in ROS."""
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     prefix: str = ""
-    """Goes before all names but those in `rename`."""
+    """Prefix of all names but those in `rename`."""
     map: str = "map"
     """Name of Cortex's `world`."""
     odom: str = "odom"
-    """Name of the frame in which a vehicle moves; its vehicle goes before it."""
+    """Name of the frame in which a vehicle moves, after the name of the vehicle."""
     rename: dict[str, str] = field(default_factory=dict)
     """Names in ROS of single frames, by their names in Cortex, such as {drone/base_link: base_link}."""
 

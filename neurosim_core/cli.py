@@ -108,7 +108,7 @@ def _parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
         description="Event cameras, RGB, depth and IMU on agile multirotors.",
     )
     parser.set_defaults(computes=True, many_blas_threads=False)
-    parser.add_argument("--debug", action="store_true", help="show where in the code an error arose")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     parser.add_argument("--version", action="version", version=f"neurosim {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for add in (_add_run, _add_serve, _add_fly, _add_up, _add_call, _add_top, _add_scene, _add_view):
@@ -131,11 +131,11 @@ def _parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
 
 
 def _add_run(commands: _Commands) -> None:
-    run = commands.add_parser("run", help="fly, record, and draw a picture of it")
+    run = commands.add_parser("run", help="fly, record, and draw an overview")
     add_settings(run)
     _add_print_config(run)
     run.add_argument(
-        "--out", type=Path, metavar="DIR", help="where to leave the flight (default: ./flight, flight-2, ...)"
+        "--out", type=Path, metavar="DIR", help="folder of the flight (default: ./flight, flight-2, ...)"
     )
     run.add_argument("--overwrite", action="store_true", help="replace a flight that is already in --out")
     run.add_argument("--no-rrd", action="store_true", help="leave out flight.rrd")
@@ -150,34 +150,34 @@ def _add_serve(commands: _Commands) -> None:
 
 
 def _add_fly(commands: _Commands) -> None:
-    fly = commands.add_parser("fly", help="the controller that follows the path, as a process of its own")
+    fly = commands.add_parser("fly", help="run the controller that follows the path, in its own process")
     add_settings(fly)
-    fly.add_argument("--vehicle", metavar="NAME", help="fly only this one (default: all)")
+    fly.add_argument("--vehicle", metavar="NAME", help="vehicle to fly (default: all)")
     fly.add_argument(
         "--mode",
         default="motor_speeds",
         choices=["motor_speeds", "velocity", "position"],
-        help="what to command (default: motor_speeds)",
+        help="type of command (default: motor_speeds)",
     )
     fly.add_argument(
-        "--delay", type=float, default=0.0, metavar="S", help="sleep before every command, to be slow [s]"
+        "--delay", type=float, default=0.0, metavar="S", help="sleep before every command, to test delay [s]"
     )
     fly.add_argument(
         "--policy",
         metavar="NAME",
-        help="let a trained policy fly a throw in this process, without a simulator: hover, or a .onnx file",
+        help="fly a throw with a trained policy in this process, without a simulator: hover, or a .onnx file",
     )
     fly.add_argument(
         "--save",
         type=Path,
         metavar="FILE",
-        help="--policy: record the flight (.h5), or film it (.webp, .gif)",
+        help="--policy: write a recording (.h5) or an animation (.webp, .gif) of the flight",
     )
     fly.set_defaults(command=_fly)
 
 
 def _add_up(commands: _Commands) -> None:
-    up = commands.add_parser("up", help="simulator, controller and viewer together; Ctrl-C ends all")
+    up = commands.add_parser("up", help="run simulator, controller and viewer together; Ctrl-C ends all")
     add_settings(up)
     _add_live(up)
     up.add_argument(
@@ -199,21 +199,23 @@ def _add_up(commands: _Commands) -> None:
 def _add_call(commands: _Commands) -> None:
     call = commands.add_parser("call", help="control a running simulator: reset, step, pause, resume, set")
     requests = call.add_subparsers(required=True, metavar="WHAT", dest="what")
-    reset = requests.add_parser("reset", help="begin again at stamp 0")
+    reset = requests.add_parser("reset", help="restart at stamp 0")
     reset.add_argument("--seed", type=int, help="seed of all noise (default: as configured)")
-    reset.add_argument("--vehicle", default="", metavar="NAME", help="which one starts elsewhere")
-    reset.add_argument("--position", type=float, nargs=3, metavar=("X", "Y", "Z"), help="in the world [m]")
-    step = requests.add_parser("step", help="let a paused run go on for some control periods")
+    reset.add_argument("--vehicle", default="", metavar="NAME", help="vehicle that starts elsewhere")
+    reset.add_argument(
+        "--position", type=float, nargs=3, metavar=("X", "Y", "Z"), help="start in the world [m]"
+    )
+    step = requests.add_parser("step", help="advance a paused run by some control periods")
     step.add_argument("count", type=int, nargs="?", default=1)
-    requests.add_parser("pause", help="stop time")
-    requests.add_parser("resume", help="let time go on")
-    change = requests.add_parser("set", help="change settings while it runs")
+    requests.add_parser("pause", help="pause simulated time")
+    requests.add_parser("resume", help="resume simulated time")
+    change = requests.add_parser("set", help="change settings of the run")
     change.add_argument(
         "settings", nargs="+", metavar="KEY=VALUE", help="such as links.command.latency_s=0.008"
     )
-    requests.add_parser("status", help="print how it is doing")
+    requests.add_parser("status", help="print the status of the run")
     for request in requests.choices.values():
-        request.add_argument("--timeout", type=float, default=10.0, metavar="S", help="wait at most [s]")
+        request.add_argument("--timeout", type=float, default=10.0, metavar="S", help="longest wait [s]")
     call.set_defaults(command=_call, computes=False)
 
 
@@ -221,49 +223,47 @@ def _add_top(commands: _Commands) -> None:
     top = commands.add_parser(
         "top", help="watch a running simulator: real-time factor, rates, losses, latency"
     )
-    top.add_argument("--once", action="store_true", help="print it once, and stop")
+    top.add_argument("--once", action="store_true", help="print once, and exit")
     top.add_argument(
-        "--timeout", type=float, default=10.0, metavar="S", help="wait for a simulator at most [s]"
+        "--timeout", type=float, default=10.0, metavar="S", help="longest wait for a simulator [s]"
     )
     top.set_defaults(command=_top, computes=False)
 
 
 def _add_scene(commands: _Commands) -> None:
-    scene = commands.add_parser("scene", help="say what is in a scene file, and draw it")
+    scene = commands.add_parser("scene", help="summarise a scene file, and draw it")
     scene.add_argument("file", type=Path, help="glTF, GLB, OBJ, PLY or STL")
-    scene.add_argument(
-        "--out", type=Path, metavar="PNG", help="where to leave the picture (default: NAME.png)"
-    )
+    scene.add_argument("--out", type=Path, metavar="PNG", help="picture to write (default: NAME.png)")
     scene.set_defaults(command=_scene)
 
 
 def _add_view(commands: _Commands) -> None:
-    view = commands.add_parser("view", help="look at a running simulator, or at a flight, in Rerun")
+    view = commands.add_parser("view", help="show a running simulator, or a recorded flight, in Rerun")
     view.add_argument(
         "flight",
         nargs="?",
         type=Path,
-        help="folder that `neurosim run` left, a flight.h5, or a file of events; default: what runs now",
+        help="folder of `neurosim run`, a flight.h5, or a file of events; default: the running simulator",
     )
     view.add_argument("--web", action="store_true", help="show it in a browser instead of a window")
     view.add_argument(
         "--save",
         type=Path,
         metavar="FILE",
-        help="write a Rerun file (.rrd) instead of opening a window; of a flight also a film (.webp, .gif)",
+        help="write a Rerun file (.rrd), or of a flight an animation (.webp, .gif), instead of a window",
     )
     view.add_argument(
         "--only", metavar="NAMES", help="live: show only these sensors, such as events,imu; others stay off"
     )
     view.add_argument(
-        "--event-window", type=float, default=0.02, metavar="S", help="time in one picture of events [s]"
+        "--event-window", type=float, default=0.02, metavar="S", help="event window of a picture [s]"
     )
     view.add_argument(
         "--image-rate",
         type=float,
         default=15.0,
         metavar="HZ",
-        help="live: most images a second [Hz]; events have a limit of their own",
+        help="live: largest image rate of a sensor [Hz]; events have a separate limit",
     )
     view.add_argument("--port", type=int, default=0, help="--web: port of the page (default: any)")
     view.add_argument("--no-browser", action="store_true", help="--web: print the address only")
@@ -272,7 +272,7 @@ def _add_view(commands: _Commands) -> None:
 
 def _add_print_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--print-config", action="store_true", help="print the settings as commented YAML, and stop"
+        "--print-config", action="store_true", help="print the settings as commented YAML, and exit"
     )
 
 
@@ -283,7 +283,7 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
         "--lockstep", action="store_true", help="wait for the command of every control period"
     )
     parser.add_argument(
-        "--factor", type=float, metavar="F", help="real-time factor; 0: as fast as it can (default: 1)"
+        "--factor", type=float, metavar="F", help="real-time factor; 0: as fast as possible (default: 1)"
     )
     parser.add_argument("--record", type=Path, metavar="DIR", help="record everything to DIR/flight.h5")
     parser.add_argument("--overwrite", action="store_true", help="replace a flight that is already there")
@@ -401,10 +401,10 @@ def _view(arguments: argparse.Namespace) -> int:
     from neurosim_core.flight import rerun_file
 
     if arguments.save is not None and arguments.save.suffix != ".rrd":
-        from neurosim_core.view.film import save_film
+        from neurosim_core.view.animation import save_animation
 
         flight = arguments.flight
-        save_film(flight / "flight.h5" if flight.is_dir() else flight, arguments.save)
+        save_animation(flight / "flight.h5" if flight.is_dir() else flight, arguments.save)
         print(f"wrote {arguments.save}")
         return 0
     file = rerun_file(arguments.flight, save=arguments.save)

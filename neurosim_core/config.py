@@ -86,69 +86,69 @@ _SEED_STRIDE = 0x9E3779B97F4A7C15
 
 
 class FleetMember(BaseConfig):
-    """One of several vehicles: what differs from the settings of the same name above it."""
+    """One of several vehicles: the settings that differ from the common ones of the same name."""
 
     vehicle: AnyVehicle | None = None
-    """The multirotor; null: the common one."""
+    """The vehicle; null: the common `vehicle`."""
     path: PathConfig | None = None
-    """Where it flies; null: as the common one, a tour with a seed of its own."""
+    """Its path; null: the common `path`, a tour with a seed of its own."""
     control: AnyController | None = None
-    """What flies it; null: as the common one."""
+    """Its controller; null: the common `control`."""
     sensors: Sensors | None = None
-    """Its sensors; null: the common ones."""
+    """Its sensors by name; null: the common `sensors`."""
     links: Links | None = None
-    """Its links; null: the common ones."""
+    """Its simulated links; null: the common `links`."""
 
 
 class SimulationConfig(BaseConfig):
     """Everything that decides the outcome of a run: same config, same device type, same bits."""
 
     duration_s: Annotated[float, Field(gt=0.0, le=1e6)] = 4.0
-    """Simulated time [s]. Both ends are sampled: 4 s at 20 Hz give 81 pictures."""
+    """Simulated time [s]. Sensors sample at both ends: 4 s at 20 Hz give 81 pictures."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
     """Seed of all sensor noise, and of turbulence."""
     device: Annotated[str, Field(pattern=r"^(auto|cpu|cuda(:\d+)?)$")] = "auto"
-    """Where to compute: auto (the first CUDA device, else the CPU), cpu, cuda:0, ..."""
+    """Device to compute on: auto (the first CUDA device, else the CPU), cpu, cuda:0, ..."""
     instants_per_launch: Annotated[int, Field(ge=1, le=1024)] = 16
-    """How many instants of the fastest camera are rendered together; changes speed and memory, not the
-    result."""
+    """Number of consecutive instants (sampling times) of the fastest camera that one launch renders; changes
+    speed and memory, not the result."""
     scene: AnyScene = Field(default_factory=lambda: find("scene", _DEFAULT_KINDS["scene"])())
-    """What surrounds the vehicle: {kind: apartment, ...} or {kind: mesh, file: house.glb, ...}."""
+    """Environment: {kind: apartment | hall, ...} or {kind: mesh, file: house.glb, ...}."""
     bodies: dict[Name, BodyConfig] = Field(default_factory=dict)
-    """What moves by itself in the scene, by name: {ball: {shape: {kind: sphere}, motion: {...}}}. Cameras see
-    bodies; paths are not planned around them, and running into one is no collision."""
+    """Moving objects of the scene, by name: {ball: {shape: {kind: sphere}, motion: {...}}}. Cameras see them;
+    paths are not planned around them, and contact with one is no collision."""
     renderer: AnyRenderer = WarpRendererConfig()
     """`warp`: ray casting on CPU and CUDA, for all cameras. `pyrender`: OpenGL, rgb and depth only.
-    `synthetic`: a test card that costs next to nothing, to measure everything else. {kind: remote, topic:
-    ...}: a renderer in another process."""
+    `synthetic`: a test pattern at almost no cost, to benchmark everything else. {kind: remote, topic: ...}: a
+    renderer in another process."""
     render: RenderConfig = RenderConfig()
-    """How the scene is lit and rendered."""
+    """Lighting and rendering of the scene."""
     free_space: FreeSpaceConfig = FreeSpaceConfig()
-    """The map that the path is planned on."""
+    """The distance map in which paths are planned."""
     vehicle: AnyVehicle = MultirotorVehicleConfig()
-    """What carries the sensors: a multirotor, or a vehicle of a plug-in by its kind."""
+    """The vehicle that carries the sensors: a multirotor, or the kind of a plug-in."""
     path: PathConfig = TourConfig()
-    """Where it flies: {kind: tour | waypoints | hover | line | circle | figure_eight | lissajous, ...};
+    """The reference path: {kind: tour | waypoints | hover | line | circle | figure_eight | lissajous, ...};
     {kind: poses, file: poses.txt, format: tum} moves the sensors along poses, without a vehicle."""
     control: AnyController = Se3ControllerConfig()
-    """What flies it: `se3`, the geometric controller, or a controller of a plug-in by its kind."""
+    """The controller: `se3`, the geometric controller, or the kind of a plug-in."""
     sensors: Sensors = Field(default_factory=default_sensors)
-    """Sensors by name. Given here, they replace the default set: a sensor that is not listed does not
-    exist, nor does one that is null, as in --set sensors.depth=null. Under the key `sensors+` they change the
-    default set or add to it."""
+    """Sensors by name. A mapping given here replaces the default set: a sensor that is not listed does not
+    exist, nor does one that is null, as in --set sensors.depth=null. The key `sensors+` changes the default
+    set or adds to it."""
     vehicles: Annotated[dict[Name, FleetMember], Field(min_length=1)] = Field(
         default_factory=lambda: {"drone": FleetMember()}
     )
-    """Vehicles by name. Several share the scene (`neurosim up`); they do not see each other. {drone: {}} is
-    one, with the settings above."""
+    """Vehicles by name. Several share the scene (`neurosim up`) and do not see each other. {drone: {}} is one
+    vehicle with the settings above."""
     live: LiveConfig = LiveConfig()
-    """How `neurosim serve` lets time pass."""
+    """Timing of `neurosim serve`: real time or lockstep, and the response to late commands."""
     sinks: dict[Name, AnySink] = Field(default_factory=default_sinks)
-    """Where packets of `neurosim run` go, by name. Given here, they replace the default set; `sinks+` adds to
-    it: {sinks+: {raw: {kind: event_file, name: events.raw}}}."""
+    """Outputs that receive the packets of `neurosim run`, by name. A mapping given here replaces the default
+    set; `sinks+` adds to it: {sinks+: {raw: {kind: event_file, name: events.raw}}}."""
     links: Links = Field(default_factory=dict)
-    """Simulated links of `neurosim serve` by what travels on them: the name of a sensor, odometry,
-    rotor_speeds or command, such as {command: {latency_s: 0.008}}."""
+    """Simulated network links of `neurosim serve` by the stream that they carry: the name of a sensor,
+    odometry, rotor_speeds or command, such as {command: {latency_s: 0.008}}."""
 
     _no_file_twice = field_validator("sinks")(check_files)
 

@@ -113,7 +113,7 @@ def fly(
     report.setup_wall_s = dict(state.wall_s)
     print_plan(console, model)
 
-    sees_events = any(sensor.packet_type is Events for sensor in config.sensors.values())
+    sees_events = any(issubclass(sensor.packet_type, Events) for sensor in config.sensors.values())
     stop = threading.Event()
     begin = time.perf_counter()
 
@@ -184,7 +184,7 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
     if not is_event_file(recorded):
         raise FileNotFoundError(
             f"no flight at {recorded}: neither a recording nor a file of events; "
-            f"`neurosim convert {recorded} events.h5` makes events of a film"
+            f"`neurosim convert {recorded} events.h5` makes events of a video"
         )
     with as_recording(recorded) as file, Recording(file) as source:
         header = source.header
@@ -228,9 +228,9 @@ def header_of(model: Model, config: SimulationConfig | None = None) -> Recording
 def saved_flight(file: Path, model: Model) -> Iterator[Callable[[Packet], None]]:
     """Give what takes the packets of a flight, and write them to a file at the end.
 
-    `file`: a recording (.h5), or a film of it (.webp, .gif).
+    `file`: a recording (.h5), or an animation of it (.webp, .gif).
     """
-    from neurosim_core.view.film import SUFFIXES, save_film
+    from neurosim_core.view.animation import SUFFIXES, save_animation
 
     if file.suffix not in (".h5", *SUFFIXES):
         raise ValueError(f"a flight is saved to a file that ends in .h5, {' or '.join(SUFFIXES)}, got {file}")
@@ -239,7 +239,7 @@ def saved_flight(file: Path, model: Model) -> Iterator[Callable[[Packet], None]]
         with RecordingWriter(recording, header_of(model)) as writer:
             yield writer.write
         if recording != file:
-            save_film(recording, file)
+            save_animation(recording, file)
 
 
 @contextlib.contextmanager

@@ -14,8 +14,6 @@ from rich.table import Table
 from neurosim_core.clock import NS_PER_S
 from neurosim_core.config import SimulationConfig, default_sensors
 from neurosim_core.packets import Collision, Events, Odometry, Packet
-from neurosim_core.sensors.event_camera import EventSensorConfig
-from neurosim_core.sensors.event_config import describe_pixel
 from neurosim_core.sensors.render_plan import RenderGroup
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.render_group import render_terms
@@ -117,7 +115,7 @@ def print_report(console: Console, model: Model, state: State, report: FlightRep
     if model.config.sensors:
         counts_of = (_describe_packets(name, report, state) for name in model.config.sensors)
         facts.add_row("packets", ", ".join(counts_of))
-    if any(sensor.packet_type is Events for sensor in model.config.sensors.values()):
+    if any(issubclass(sensor.packet_type, Events) for sensor in model.config.sensors.values()):
         rate = report.event_count / simulated_s / 1e6 if simulated_s else 0.0
         dropped = counts["events dropped"]
         facts.add_row("events", f"{report.event_count:,} ({rate:.2f} M/s), {dropped:,} dropped")
@@ -132,8 +130,8 @@ def print_report(console: Console, model: Model, state: State, report: FlightRep
     for name, terms in _terms(model, state).items():
         facts.add_row(f"compiled {name}", ", ".join(terms) or "nothing optional")
     for name, sensor in model.config.sensors.items():
-        if isinstance(sensor, EventSensorConfig):
-            facts.add_row(f"pixels of {name}", describe_pixel(sensor.pixel))
+        for title, describe in sensor.reported.items():
+            facts.add_row(f"{title} of {name}", describe(sensor))
     console.print()
     console.print(facts, highlight=False)
 

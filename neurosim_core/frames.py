@@ -36,12 +36,12 @@ _MOUNT_MAX_M = 20.0
 
 
 class Mount(BaseConfig):
-    """Where a sensor sits on the body: exactly T_BS, no hidden lift or lever arm."""
+    """Pose of a sensor on the body, T_BS, exactly as given."""
 
     position_m: Vector3 = (0.0, 0.0, 0.0)
     """Origin of the sensor in the body frame (x forward, y left, z up) [m]."""
     rpy_rad: Vector3 = (0.0, 0.0, 0.0)
-    """Roll, pitch, yaw of the sensor against the body [rad]: R = Rz(yaw) Ry(pitch) Rx(roll). A camera
+    """Roll, pitch, yaw of the sensor relative to the body [rad]: R = Rz(yaw) Ry(pitch) Rx(roll). A camera
     with zeros looks forward; positive pitch looks down."""
 
     @model_validator(mode="after")

@@ -22,8 +22,8 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         "config", nargs="?", type=Path, help="settings file (YAML); default: a generated apartment"
     )
     parser.add_argument("--duration", type=float, metavar="S", help="simulated time [s]")
-    parser.add_argument("--seed", type=int, help="seed of the noise of the sensors; of a first flight")
-    parser.add_argument("--device", help="auto, cpu, cuda:0, ...")
+    parser.add_argument("--seed", type=int, help="seed of the sensor noise; data sets: of the first flight")
+    parser.add_argument("--device", help="device to compute on: auto, cpu, cuda:0, ...")
     add_set_option(parser, "any setting by its dotted key, such as scene.seed=3; may be repeated")
 
 

@@ -1,4 +1,4 @@
-"""The registry of plug-ins: a table kind -> class for each seam; others are added by entry points.
+"""The registry of plug-ins: a table kind -> class for each category; others are added by entry points.
 
 A package adds its own sensors, vehicles, ... by registering classes in a module that an entry point of the
 group `neurosim.plugins` names; the module is imported when a kind is asked for that is not of Neurosim:
@@ -22,7 +22,7 @@ from typing import TypeVar
 ENTRY_POINT_GROUP = "neurosim.plugins"
 """Entry points whose modules register what they bring."""
 
-SEAMS = ("sensor", "vehicle", "controller", "renderer", "scene", "sink", "noise", "task")
+CATEGORIES = ("sensor", "vehicle", "controller", "renderer", "scene", "sink", "noise", "task")
 """What can be registered."""
 
 _OWN = {
@@ -39,37 +39,37 @@ _OWN = {
 Registered = TypeVar("Registered", bound=type)
 
 _logger = logging.getLogger(__name__)
-_tables: dict[str, dict[str, type]] = {seam: {} for seam in SEAMS}
+_tables: dict[str, dict[str, type]] = {category: {} for category in CATEGORIES}
 _loaded = False
 
 
-def register(seam: str, kind: str) -> Callable[[Registered], Registered]:
+def register(category: str, kind: str) -> Callable[[Registered], Registered]:
     """Return a decorator that adds a class to a table.
 
     Args:
-        seam: One of `SEAMS`.
+        category: One of `CATEGORIES`.
         kind: The name under which settings ask for the class, such as "depth".
 
     Raises:
-        TypeError: The class lacks what every class of the seam has.
-        ValueError: There is no such seam, another class has this kind, or the class says that it has another.
+        TypeError: The class lacks what every class of the category has.
+        ValueError: No such category, the kind is of another class, or the class says that it has another.
     """
-    table = _table(seam)
+    table = _table(category)
 
     def add(cls: Registered) -> Registered:
         if not cls.__module__.startswith("neurosim_core."):
-            _import_own(seam)  # a kind of our own is taken, whoever comes first
+            _import_own(category)  # a kind of our own is taken, whoever comes first
             load_plugins()
         known = table.get(kind)
         if known is not None and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
             raise ValueError(
-                f"the {seam} kind {kind!r} is taken by {known.__module__}.{known.__qualname__}: "
+                f"the {category} kind {kind!r} is taken by {known.__module__}.{known.__qualname__}: "
                 f"give {cls.__module__}.{cls.__qualname__} another"
             )
         own = getattr(cls, "model_fields", {}).get("kind")
         if own is not None and own.default != kind:
             raise ValueError(
-                f"{cls.__qualname__} is registered as the {seam} kind {kind!r}, and its field `kind` says "
+                f"{cls.__qualname__} is registered as {category} kind {kind!r}, and its field `kind` says "
                 f"{own.default!r}: give both the same name"
             )
         check: Callable[[], None] | None = getattr(cls, "check_class", None)
@@ -81,41 +81,41 @@ def register(seam: str, kind: str) -> Callable[[Registered], Registered]:
     return add
 
 
-def kinds(seam: str) -> Mapping[str, type]:
-    """Return the classes of a seam by kind, those of installed plug-ins included.
+def kinds(category: str) -> Mapping[str, type]:
+    """Return the classes of a category by kind, those of installed plug-ins included.
 
     Raises:
-        ValueError: There is no such seam.
+        ValueError: There is no such category.
     """
-    table = registered(seam)
-    _import_own(seam)
+    table = registered(category)
+    _import_own(category)
     load_plugins()
     return table
 
 
-def registered(seam: str) -> Mapping[str, type]:
-    """Return the classes of a seam by kind that have been imported until now.
+def registered(category: str) -> Mapping[str, type]:
+    """Return the classes of a category by kind that have been imported until now.
 
     Raises:
-        ValueError: There is no such seam.
+        ValueError: There is no such category.
     """
-    return MappingProxyType(_table(seam))
+    return MappingProxyType(_table(category))
 
 
-def find(seam: str, kind: str) -> type:
+def find(category: str, kind: str) -> type:
     """Return the class of a kind.
 
     Raises:
-        ValueError: There is no such seam or kind; the message has those that are known.
+        ValueError: There is no such category or kind; the message has those that are known.
     """
-    table = _table(seam)
-    if kind not in table and kind in (own := _own_modules(seam)):
+    table = _table(category)
+    if kind not in table and kind in (own := _own_modules(category)):
         importlib.import_module(own[kind])
     if kind not in table:
-        _import_own(seam)
+        _import_own(category)
         load_plugins()
     if kind not in table:
-        raise ValueError(f"unknown {seam} kind {kind!r}, known: {sorted(table)}")
+        raise ValueError(f"unknown {category} kind {kind!r}, known: {sorted(table)}")
     return table[kind]
 
 
@@ -132,18 +132,18 @@ def load_plugins() -> None:
     _loaded = True
     from importlib.metadata import entry_points  # which is slow to import, and few runs need
 
-    for seam in SEAMS:
-        if seam != "task":
-            _import_own(seam)
+    for category in CATEGORIES:
+        if category != "task":
+            _import_own(category)
     for entry in entry_points(group=ENTRY_POINT_GROUP):
-        before = {seam: dict(table) for seam, table in _tables.items()}
+        before = {category: dict(table) for category, table in _tables.items()}
         try:
             entry.load()
         except Exception as error:  # whatever a foreign module raises when it is imported
-            for seam, table in _tables.items():
+            for category, table in _tables.items():
                 broken = [
                     kind
-                    for kind in table.keys() - before[seam].keys()
+                    for kind in table.keys() - before[category].keys()
                     if table[kind].__module__ not in sys.modules
                 ]
                 for kind in broken:
@@ -151,21 +151,21 @@ def load_plugins() -> None:
             _logger.warning("the plug-in %s (%s) cannot be loaded: %s", entry.name, entry.value, error)
 
 
-def _import_own(seam: str) -> None:
-    for module in _own_modules(seam).values():
+def _import_own(category: str) -> None:
+    for module in _own_modules(category).values():
         importlib.import_module(module)
 
 
-def _own_modules(seam: str) -> dict[str, str]:
-    """Return the modules of our own kinds of a seam; of sensors all, some of which have none."""
-    if seam == "sensor":
+def _own_modules(category: str) -> dict[str, str]:
+    """Return the modules of our own kinds of a category; of sensors all, some of which have none."""
+    if category == "sensor":
         sensors = importlib.import_module("neurosim_core.sensors")
         names = (module.name for module in pkgutil.iter_modules(sensors.__path__))
         return {name: f"{sensors.__name__}.{name}" for name in names}
-    return {kind: f"neurosim_core.{module}" for kind, module in _OWN.get(seam, {}).items()}
+    return {kind: f"neurosim_core.{module}" for kind, module in _OWN.get(category, {}).items()}
 
 
-def _table(seam: str) -> dict[str, type]:
-    if seam not in _tables:
-        raise ValueError(f"unknown seam {seam!r}, known: {', '.join(SEAMS)}")
-    return _tables[seam]
+def _table(category: str) -> dict[str, type]:
+    if category not in _tables:
+        raise ValueError(f"unknown category {category!r}, known: {', '.join(CATEGORIES)}")
+    return _tables[category]

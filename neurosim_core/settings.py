@@ -69,24 +69,24 @@ def _parts(annotation: Any) -> Iterator[Any]:
 
 
 class OfKind:
-    """Settings of any kind of a seam: `Annotated[SensorConfig, OfKind("sensor")]`.
+    """Settings of any kind of a category: `Annotated[SensorConfig, OfKind("sensor")]`.
 
     Which class they are of is looked up when they are read: only kinds that are in use are imported.
     """
 
-    def __init__(self, seam: str, *, default: str | None = None) -> None:
+    def __init__(self, category: str, *, default: str | None = None) -> None:
         """Say which settings.
 
         Args:
-            seam: A table of the registry.
+            category: A table of the registry.
             default: The kind where none is said; then a name alone is a kind, too.
         """
-        self.seam = seam
+        self.category = category
         self._default = default
 
     def choices(self) -> list[type[BaseModel]]:
         """Return the classes of all kinds."""
-        return [*kinds(self.seam).values()]
+        return [*kinds(self.category).values()]
 
     def __get_pydantic_core_schema__(self, base: type[BaseModel], _: GetCoreSchemaHandler) -> CoreSchema:
         """Return how to read them; errors are those of a union that is discriminated by `kind`."""
@@ -102,9 +102,9 @@ class OfKind:
             if kind is None:
                 raise PydanticKnownError("union_tag_not_found", {"discriminator": "'kind'"})
             try:
-                settings: type[BaseModel] = find(self.seam, kind)
+                settings: type[BaseModel] = find(self.category, kind)
             except (ValueError, TypeError):  # unknown; no name
-                known = ", ".join(map(repr, kinds(self.seam)))
+                known = ", ".join(map(repr, kinds(self.category)))
                 context = {"discriminator": "'kind'", "tag": str(kind), "expected_tags": known}
                 raise PydanticKnownError("union_tag_invalid", context) from None
             choice = core_schema.tagged_union_schema({kind: settings.__pydantic_core_schema__}, "kind")

@@ -219,9 +219,9 @@ class EventFileSinkConfig(SinkConfig):
 
     kind: Literal["event_file"] = "event_file"
     name: Annotated[str, Field(pattern=r"^[^/]+$")]
-    """Its name; the suffix says the format, as for `neurosim convert`: events.raw, events.aedat4, a.mcap."""
+    """File name; the suffix sets the format, as in `neurosim convert`: events.raw, events.aedat4, a.mcap."""
     sensor: str = ""
-    """Which event camera; empty: the first."""
+    """Name of the event camera; empty: the first."""
 
     @field_validator("name")
     @classmethod
@@ -249,9 +249,9 @@ class EventFileSinkConfig(SinkConfig):
     def create(self, name: str, sensors: Mapping[str, SensorConfig], file: Path) -> tuple[str, EventWriter]:
         """Return the name of the camera and the writer of its events; arguments and errors as for `check`."""
         from neurosim_core.io import create_events
-        from neurosim_core.sensors.event_camera import EventSensorConfig
+        from neurosim_core.record.header import describe_sensors
 
-        cameras = {key: each.lens for key, each in sensors.items() if isinstance(each, EventSensorConfig)}
+        cameras = {s.name: s.intrinsics for s in describe_sensors(sensors) if s.has_events and s.intrinsics}
         camera = self.sensor or next(iter(cameras), "")
         if camera not in cameras:
             if not cameras:

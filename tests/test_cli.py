@@ -128,7 +128,7 @@ def test_a_rerun_file_can_be_made_from_the_recording(flown, tmp_path):
     assert (tmp_path / "again.rrd").stat().st_size > 100_000
 
 
-def test_a_film_can_be_made_from_the_recording(flown, tmp_path):
+def test_an_animation_can_be_made_from_the_recording(flown, tmp_path):
     """Four pictures in 0.3 s at 10 Hz, the plan beside the pictures; the path grows."""
     folder, _ = flown
     assert cli.main(["view", str(folder), "--save", str(tmp_path / "film.webp")]) == 0
@@ -293,7 +293,7 @@ def test_a_signal_ends_a_command_that_cannot_say_so():
     [
         (
             "convert in.csv out.raw --set pixel.threshold_on=0.3 --seed 0",
-            "--seed, --set: for a film, and this",
+            "--seed, --set: for a video, and this",
         ),
         ("convert in.mp4 out.h5 --from-zero --to evt3", "--to, --from-zero: for a file of events, and this"),
         ("view flight --save film.mp4", "--save writes .rrd or .webp or .gif here, got film.mp4"),

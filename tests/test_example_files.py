@@ -125,7 +125,7 @@ def test_a_kind_that_is_taken_is_refused():
 def test_an_unknown_seam_or_kind_is_said():
     from neurosim_core import registry
 
-    with pytest.raises(ValueError, match="unknown seam 'sensors', known: sensor, vehicle"):
+    with pytest.raises(ValueError, match="unknown category 'sensors', known: sensor, vehicle"):
         registry.kinds("sensors")
     with pytest.raises(ValueError, match=r"unknown sensor kind 'sonar', known: .*'depth'"):
         registry.find("sensor", "sonar")

@@ -40,7 +40,7 @@ MISTAKES = {
     "scene bad.glb": "bad.glb: not a GLB file",
     "view": "there is no display to open a window on: `neurosim view --web` serves a page",
     "view flight": "`neurosim run --out flight` makes one",
-    "view film.mp4": "`neurosim convert film.mp4 events.h5` makes events of a film",
+    "view film.mp4": "`neurosim convert film.mp4 events.h5` makes events of a video",
     "view bad.h5": "bad.h5 is not a readable HDF5 file",
     "convert bad.h5 out.xyz": "known: .raw, .evt2.raw, .dat",
     "bench stepp": "did you mean 'step'?",

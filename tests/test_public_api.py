@@ -24,7 +24,7 @@ def test_what_a_plug_in_starts_from_is_there(package):
 
 
 @pytest.mark.parametrize(
-    ("seam", "known"),
+    ("category", "known"),
     [
         ("vehicle", ["multirotor"]),
         ("controller", ["se3"]),
@@ -33,8 +33,8 @@ def test_what_a_plug_in_starts_from_is_there(package):
         ("sink", ["cortex", "event_file", "hdf5", "overview", "rerun"]),
     ],
 )
-def test_a_seam_lists_our_kinds_before_anything_else_is_used(seam, known):
-    code = f"import neurosim_core as ns; print(sorted(ns.registry.kinds({seam!r})))"
+def test_a_category_lists_our_kinds_before_anything_else_is_used(category, known):
+    code = f"import neurosim_core as ns; print(sorted(ns.registry.kinds({category!r})))"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.strip() == str(known)
 

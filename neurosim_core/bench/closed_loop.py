@@ -103,8 +103,8 @@ def _chapter(rows: list[Row], title: str) -> Chapter:
     return Chapter(
         name="closed-loop",
         title="The closed loop between processes",
-        summary=f"{title}, hover. In lockstep an image has felt a command after "
-        f"{fastest['command to image [ms]']:.3f} ms in the median, and {fastest['received [Hz]']:,.0f} "
+        summary=f"{title}, hover. In lockstep the first image that shows a command comes "
+        f"{fastest['command to image [ms]']:.3f} ms after it (median), and {fastest['received [Hz]']:,.0f} "
         "images a second come.",
         claims=[
             Claim(f"the transport of an image takes at most {TRANSPORT_MS:g} ms in the median at every rate",

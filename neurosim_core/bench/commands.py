@@ -68,9 +68,9 @@ QUESTIONS: Sequence[Question] = (
     Question("throughput", "whole steps a second, and what their parts take", ("scene", "device", "samples")),
     Question("worlds", "renders a second of many worlds stepped together", (*_VIEW, "worlds", "seconds")),
     Question("data", "windows a second from a recording, for learning"),
-    Question("leave-out", "what a scene does not need is not computed: kernels, memory, libraries, time"),
+    Question("leave-out", "work that a scene does not need is left out: kernels, memory, libraries, time"),
     Question("step", "whole steps a second with one event camera", (*_VIEW, *_STEPS), False),
-    Question("closed-loop", "from command to image between processes", (*_VIEW, *_LOOP), False),
+    Question("closed-loop", "latency from command to image between processes", (*_VIEW, *_LOOP), False),
     Question("streaming", "an IMU beside an event camera in real time", (*_VIEW, *_STREAM), False),
     Question("delay", "a slow controller against the same delay in lockstep", _DELAY, False),
 )
@@ -91,8 +91,8 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def _add(parser: argparse.ArgumentParser, questions: list[Question], folder: str = "") -> None:
     folder = folder or questions[0].name
-    parser.add_argument("--out", default=folder, metavar="DIR", help=f"where to leave files (./{folder})")
-    parser.add_argument("--json", action="store_true", help="print the chapters as JSON, and nothing else")
+    parser.add_argument("--out", default=folder, metavar="DIR", help=f"folder of the results (./{folder})")
+    parser.add_argument("--json", action="store_true", help="print the chapters as JSON only")
     parser.add_argument("--resume", action="store_true", help="keep what is already in --out")
     parser.add_argument("--strict", action="store_true", help="exit with status 1 if a claim is missed")
     for option in dict.fromkeys(option for question in questions for option in ("quick", *question.options)):

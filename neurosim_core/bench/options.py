@@ -41,24 +41,24 @@ def _option(text: str, default: Any = None, **argument: Any) -> Any:
 class Options:
     """Options of a benchmark; None leaves the choice to the benchmark."""
 
-    quick: bool = _option("a small version; its figures are rough", False, action="store_true")
+    quick: bool = _option("short run with rough figures", False, action="store_true")
     scene: Path | None = _option("mesh file; default: a generated scene", type=Path, metavar="FILE")  # noqa: RUF009
     device: str = _option("auto, cpu, cuda:0, ... (default: auto)", default="auto")
     width: int | None = _option("columns of the camera", type=_whole, metavar="PX")
     height: int | None = _option("rows of the camera", type=_whole, metavar="PX")
     samples: tuple[int, ...] | None = _option("rays per pixel", type=_numbers(int), metavar="N,...")
-    seconds: float | None = _option("how long to measure or fly each case", type=float, metavar="S")
+    seconds: float | None = _option("duration of each case [s]", type=float, metavar="S")
     worlds: tuple[int, ...] | None = _option("numbers of worlds", type=_numbers(int), metavar="N,...")
     instants: int = _option("renders per launch (default: 16)", 16, type=_whole, metavar="K")
     steps: int = _option("steps per repetition (default: 1600)", 1600, type=_whole, metavar="N")
     max_displacement: float | None = _option(
-        "render only so often that nothing moves further between two renders", type=float, metavar="PX"
+        "adaptive sampling: largest motion of a point between two renders [px]", type=float, metavar="PX"
     )
     rates: tuple[float, ...] | None = _option(
-        "commands and images a second", type=_numbers(float), metavar="HZ,..."
+        "command and image rates [Hz]", type=_numbers(float), metavar="HZ,..."
     )
     renderer: str = _option(
-        "synthetic: a test card, to measure all but rendering; warp: the scene (default: synthetic)",
+        "synthetic: a test pattern, to measure all but rendering; warp: the scene (default: synthetic)",
         "synthetic",
         choices=["synthetic", "warp"],
     )
@@ -66,11 +66,11 @@ class Options:
         "renders of the event camera a second (default: 25, on a GPU 500)", type=float, metavar="HZ"
     )
     delays: tuple[float, ...] | None = _option(
-        "what the controller sleeps before commands", type=_numbers(float), metavar="S,..."
+        "sleeps of the controller before commands [s]", type=_numbers(float), metavar="S,..."
     )
-    tours: int | None = _option("how many paths to fly", type=int, metavar="N")
+    tours: int | None = _option("number of paths to fly", type=int, metavar="N")
     mode: str = _option(
-        "what is commanded (default: velocity)", "velocity", choices=["motor_speeds", "velocity", "position"]
+        "type of command (default: velocity)", "velocity", choices=["motor_speeds", "velocity", "position"]
     )
     logs: tuple[Path, ...] | None = _option(
         "logs of flights: time [s], accelerometer [g], gyroscope [deg/s], commands of four motors [PWM]",

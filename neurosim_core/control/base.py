@@ -54,9 +54,9 @@ class ControllerConfig(BaseConfig):
     kind: str
     """Under which name the class is registered."""
     rate_hz: Annotated[float, Field(gt=0.0, le=10_000.0)] = 200.0
-    """Commands a second [Hz]; each is held until the next."""
+    """Command rate [Hz]; each command is held until the next."""
     gains: Se3Config = Se3Config()
-    """Gains and limits of the geometric controller; it also turns outside setpoints into rotor speeds."""
+    """Gains and limits of the geometric controller, which also turns external setpoints into rotor speeds."""
 
     def make(self, context: ControllerContext) -> PathController:
         """Return the controller of all worlds."""

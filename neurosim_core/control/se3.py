@@ -58,18 +58,18 @@ class Se3Config(BaseConfig):
     yaw_rate_gain_per_s: Gain = 10.0
     """Angular acceleration per rad/s of yaw rate error [1/s]."""
     correction_speed_max_m_s: Limit = 4.0
-    """Highest velocity that a position error may ask for, on top of the reference's [m/s]."""
+    """Largest velocity that corrects a position error, in addition to the reference's [m/s]."""
     correction_acceleration_max_m_s2: Limit = 8.0
-    """Highest acceleration that errors may ask for, on top of the reference's [m/s^2]. Below 9.81, errors
+    """Largest acceleration that corrects errors, in addition to the reference's [m/s^2]. Below 9.81, errors
     alone never turn the vehicle upside down."""
     body_rate_max_rad_s: Limit = 20.0
-    """Highest body rate that is asked for [rad/s], as feed-forward or as a command."""
+    """Largest body rate, from feed-forward or as a command [rad/s]."""
     motor_response_s: Limit = 0.02
     """Motors that are slower than this are overdriven so that they close on the wanted speed with this time
     constant [s], as far as their limits allow; needs measured rotor speeds. Choose it no shorter than the
     control period."""
     feed_forward_air: bool = True
-    """Cancel drag and lift as the vehicle's own model gives them in still air; wind remains a disturbance."""
+    """Whether drag and lift of the vehicle's own model in still air are cancelled; wind is a disturbance."""
 
 
 @wp.struct

@@ -25,45 +25,44 @@ _BURST_SHARE_MAX = 0.5
 _OPTIONS: dict[str, dict[str, Any]] = {
     "preset": {
         "dest": "pixel.preset",
-        "help": "pixels of a sensor: davis346, imx636, v2e_noisy, ...",
+        "help": "preset of the event camera: davis346, imx636, v2e_noisy, ...",
         "metavar": "NAME",
     },
     "size": {
         "help": "resolution of the sensor; `preset`: that of the preset (default: as it is)",
         "metavar": "WxH",
     },
-    "crop": {"help": "take this part of the picture", "metavar": "WxH+X+Y"},
+    "crop": {"help": "part of the picture to convert", "metavar": "WxH+X+Y"},
     "fit": {
-        "help": "where --size has another shape (default: crop the middle)",
+        "help": "where --size has another aspect ratio (default: crop the middle)",
         "choices": ("crop", "stretch"),
     },
     "fps": {
-        "help": "frames a second; needed for folders, else as the video says",
+        "help": "frame rate [Hz]; needed for folders (default: as the video says)",
         "type": float,
         "metavar": "HZ",
     },
-    "timestamps": {"help": "time of each frame, one a line, instead of --fps", "metavar": "FILE"},
+    "timestamps": {"help": "file of frame times, one per line, instead of --fps", "metavar": "FILE"},
     "time-unit": {
-        "help": "of --timestamps (default: seconds), or of events in a text, NPZ or HDF5 file that does not "
-        "say it",
+        "help": "unit of --timestamps (default: s), or of events in a file that does not say it",
         "choices": ("s", "ms", "us", "ns"),
     },
     "slow-motion": {
-        "help": "how much slower than the world the video runs: 8 if filmed at 240 Hz and played at 30",
+        "help": "factor by which the video is slower than the world: 8 if filmed at 240 Hz and played at 30",
         "metavar": "FACTOR",
         "type": float,
     },
     "transfer": {
-        "help": "how numbers become light: srgb, bt709, linear, pq, ... (default: auto)",
+        "help": "transfer function of pixel values: srgb, bt709, linear, pq, ... (default: auto)",
         "metavar": "NAME",
     },
     "dark-floor": {
-        "help": "added before the logarithm; white is 1 (default: 0.001, or what it takes for a step of the "
-        "stored numbers to be half a threshold at most)",
+        "help": "luminance added before the logarithm; white is 1 (default: 0.001, or so much that a step "
+        "of the stored numbers is half a threshold at most)",
         "metavar": "L",
         "type": float,
     },
-    "seed": {"help": "seed of the noise of the pixels", "type": int},
+    "seed": {"help": "seed of the pixel noise", "type": int},
 }
 
 
@@ -71,9 +70,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add `convert` to the commands of `neurosim`."""
     parser = commands.add_parser(
         "convert",
-        help="turn a video or a folder of pictures into events, or events into another format",
-        description="Let a simulated event camera look at a video (needs PyAV) or at the pictures of a "
-        "folder, and write its events as `neurosim run` does. Log radiance is linear between frames. Or copy "
+        help="convert a video or a folder of pictures to events, or events to another format",
+        description="Convert a video (needs PyAV) or the pictures of a folder to events of a simulated "
+        "camera, and write them as `neurosim run` does. Log radiance is linear between frames. Or convert "
         "events from one format to another: .raw (EVT3), .evt2.raw, .dat, .csv, .npz, .aedat4, .es (read), "
         "or, with pictures, depth, poses and IMU: mvsec.h5, .h5, and bags of ROS 2: flight.mcap, bag.",
     )
@@ -85,9 +84,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     events.add_argument("--from", dest="source_format", metavar="FORMAT", help="default: by the suffix")
     events.add_argument("--to", dest="out_format", metavar="FORMAT", help="default: by the suffix")
     events.add_argument("--sensor", default="", metavar="NAME", help="event camera (default: the first)")
-    events.add_argument("--from-zero", action="store_true", help="count time from the first event")
+    events.add_argument("--from-zero", action="store_true", help="shift time to begin at the first event")
     parser.add_argument("--device", default="auto", help="auto, cpu, cuda:0, ...")
-    parser.add_argument("--overwrite", action="store_true", help="replace a file that is there")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
     add_set_option(parser, "any setting by its dotted key, such as pixel.threshold_on=0.15; may be repeated")
     parser.set_defaults(command=_convert)
 
@@ -107,14 +106,14 @@ def _convert(arguments: argparse.Namespace) -> int:
 
 def _check_options(arguments: argparse.Namespace, *, is_events: bool) -> None:
     """Refuse options that do nothing with what is converted."""
-    films = {name: _setting(name) for name in _OPTIONS if name not in ("size", "time-unit")}
+    videos = {name: _setting(name) for name in _OPTIONS if name not in ("size", "time-unit")}
     events = {"to": "out_format", "sensor": "sensor", "from-zero": "from_zero"}
-    others = films | {"set": "settings"} if is_events else events
+    others = videos | {"set": "settings"} if is_events else events
     values = {name: getattr(arguments, key) for name, key in others.items()}
     if given := [
         f"--{name}" for name, value in values.items() if value or (value == 0 and value is not False)
     ]:
-        kind = "a film, and this is a file of events" if is_events else "a file of events, and this is none"
+        kind = "a video, and this is a file of events" if is_events else "a file of events, and this is none"
         raise ValueError(f"{', '.join(given)}: for {kind}: {arguments.source}")
 
 

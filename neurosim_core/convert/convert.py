@@ -56,35 +56,35 @@ _CODE_STEP_MAX = 0.5
 
 
 class ConversionConfig(BaseConfig):
-    """How a video becomes events."""
+    """Conversion of a video to events."""
 
     pixel: EventCameraConfig = EventCameraConfig()
-    """The law of the pixels."""
+    """Pixel model: thresholds and noise."""
     size: str | None = None
     """Width and height of the sensor, such as 346x260: pictures are averaged to it, in linear light, or
     interpolated where they are smaller. "preset": those of the sensor that `pixel.preset` names. null: those
     of the video."""
     crop: str | None = None
-    """Part of the picture that is taken, WIDTHxHEIGHT+X+Y in pixels; null: all of it."""
+    """Part of the picture to convert, WIDTHxHEIGHT+X+Y in pixels; null: all of it."""
     fit: Literal["crop", "stretch"] = "crop"
-    """Where `size` has another shape than the picture: take the middle of the picture, or distort it."""
+    """Where `size` has another aspect ratio than the picture: crop it around its middle, or stretch it."""
     fps: Annotated[float, Field(gt=0.0, le=1e6)] | None = None
-    """Frames a second [Hz]; null: the times that are in the video."""
+    """Frame rate [Hz]; null: the times in the video."""
     timestamps: str | None = None
-    """File with the time of each frame, one a line."""
+    """File with the time of each frame, one per line; null: see `fps`."""
     time_unit: Literal["s", "ms", "us", "ns"] = "s"
-    """What the numbers in `timestamps` are in."""
+    """Unit of the numbers in `timestamps`."""
     slow_motion: Annotated[float, Field(gt=0.0, le=1e6)] = 1.0
-    """How much slower than the world the video runs: all times are divided by it. A video filmed at 240 Hz
-    that plays at 30 Hz has 8; one sped up has less than 1."""
+    """Factor by which the video plays slower than the world: all times are divided by it. A video filmed at
+    240 Hz that plays at 30 Hz has 8; one that plays faster has less than 1."""
     transfer: str = "auto"
-    """How numbers become light: srgb, bt709, linear, gamma22, gamma28, smpte240m, log100, log316, pq, hlg; or
-    auto: as the file says, else sRGB."""
+    """Transfer function of pixel values: srgb, bt709, linear, gamma22, gamma28, smpte240m, log100, log316,
+    pq, hlg; or auto: as the file says, else sRGB."""
     dark_floor: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
     """Luminance that is added before the logarithm, white is 1. null: 0.001, as rendered scenes have, or as
     much more as it takes for one step of the stored numbers to be at most half a threshold."""
     seed: Annotated[int, Field(ge=0, lt=1 << 64)] = 0
-    """Seed of the noise of the pixels."""
+    """Seed of the pixel noise."""
 
     @field_validator("transfer")
     @classmethod

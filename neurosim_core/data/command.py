@@ -21,26 +21,26 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add `dataset` to the commands of `neurosim`."""
     parser = commands.add_parser(
         "dataset",
-        help="make a data set: many flights, each with seeds of its own",
-        description="Fly a configuration many times, with other seeds, and write recordings, a card and "
-        "checksums. Started again after an interruption, it goes on; the bytes are the same.",
+        help="make a data set: many flights with different seeds",
+        description="Fly a configuration many times, with different seeds, and write recordings, a data card "
+        "and checksums. After an interruption, the same command resumes; the bytes are the same.",
     )
     add_settings(parser)
-    parser.add_argument("--flights", type=int, required=True, metavar="N", help="how many")
+    parser.add_argument("--flights", type=int, required=True, metavar="N", help="number of flights")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the data set")
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; 0: this one")
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; 0: this process")
     parser.add_argument(
         "--ray",
         nargs="?",
         const="auto",
         metavar="ADDRESS",
-        help="fly on a Ray cluster: local, host:port, or auto (the default); --workers at a time",
+        help="fly on a Ray cluster: local, host:port, or auto (default), --workers flights at a time",
     )
     parser.add_argument(
         "--flights-per-scene", type=int, default=10, metavar="N", help="flights in one generated scene"
     )
     parser.add_argument(
-        "--webdataset", type=Path, metavar="DIR", help="write windows of 50 ms as shards for WebDataset, too"
+        "--webdataset", type=Path, metavar="DIR", help="also write windows of 50 ms as shards for WebDataset"
     )
     parser.set_defaults(command=_make)
 
@@ -118,7 +118,7 @@ def add_compare_parser(commands: argparse._SubParsersAction[argparse.ArgumentPar
     )
     parser.add_argument("files", nargs="+", type=Path, help="files of events, or folders of them")
     parser.add_argument("--out", type=Path, default=Path("compare.png"), help="PNG, PDF or SVG to write")
-    parser.add_argument("--size", metavar="WxH", help="resolution, of files that do not say it")
+    parser.add_argument("--size", metavar="WxH", help="resolution, for files that do not give it")
     parser.add_argument("--sensor", default="", metavar="NAME", help="event camera (default: the first)")
     parser.set_defaults(command=_compare)
 

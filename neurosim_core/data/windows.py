@@ -22,7 +22,9 @@ from neurosim_core.packets import (
     ImuSample,
     Odometry,
     Packet,
+    PacketSchema,
     join_events,
+    schema_of,
 )
 
 _ENCODINGS = {"32FC1": "depth", "32FC2": "flow", "rgb8": "rgb", "mono8": "rgb"}
@@ -35,18 +37,18 @@ _SKIPPED_MAX = 20
 
 @dataclass(frozen=True, kw_only=True)
 class WindowConfig:
-    """Which windows are cut, and what they have."""
+    """Windows to cut from a stream of events, and their fields."""
 
     window_s: float = 0.05
     """Length of a window, in whole microseconds [s]."""
     stride_s: float | None = None
-    """From one window to the next [s]; None: they follow on each other."""
+    """Time from one window to the next [s]; None: `window_s`."""
     ends: str | None = None
-    """Field at whose packets windows end, whatever their times; None: at multiples of the stride."""
+    """Field whose packets end the windows; None: windows end at multiples of the stride."""
     fields: Sequence[str] | None = None
-    """What to take of `FIELDS`; None: all that a source has."""
+    """Fields to return, of `FIELDS`; None: all that a source has."""
     sensors: Mapping[str, str] = field(default_factory=dict)
-    """Name of the sensor for a field; by default the first that fits."""
+    """Name of the sensor for each field; by default the first that fits."""
 
     def __post_init__(self) -> None:
         for name, value in (("window_s", self.window_s), ("stride_s", self.stride_s)):
@@ -79,9 +81,9 @@ class WindowConfig:
         return self.fields is None or name in self.fields
 
 
-def field_of(kind: str, encoding: str) -> str | None:
+def field_of(schema: PacketSchema, encoding: str) -> str | None:
     """Return the field that packets of a class give, whose pictures have an encoding."""
-    named = {"Events": "events", "ImuSample": "imu", "Odometry": "pose"}.get(kind)
+    named = "events" if schema.has_events else {"ImuSample": "imu", "Odometry": "pose"}.get(schema.name)
     return named or _ENCODINGS.get(encoding)
 
 
@@ -120,7 +122,7 @@ class PacketWindows:
 
     def add(self, packet: Packet) -> Iterator[Sample]:
         """Take a packet, and yield the windows that are complete with it."""
-        name = field_of(type(packet).__name__, getattr(packet, "encoding", ""))
+        name = field_of(schema_of(type(packet)), getattr(packet, "encoding", ""))
         if name is None or self._watched.get(name) != packet.sensor:
             return
         if isinstance(packet, Events):

@@ -22,7 +22,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     """Add `fit-sensor` to the commands of `neurosim`."""
     parser = commands.add_parser(
         "fit-sensor",
-        help="find the settings of your event camera from recordings of it",
+        help="estimate the settings of your event camera from recordings",
         description="Estimate leak, shot noise, hot pixels and dead time of an event camera from a recording "
         "of a still, evenly lit surface, and thresholds, their spread and jitter and the readout from one of "
         "light that is switched between two levels. Writes settings with their standard errors, and a "
@@ -35,14 +35,14 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "--contrast",
         type=float,
         metavar="RATIO",
-        help="bright over dark light of the steps; needed with them",
+        help="ratio of bright to dark light; required with steps",
     )
     parser.add_argument(
         "--rise",
         type=float,
         default=0.0,
         metavar="S",
-        help="time that light takes from one level to the other, linear in its logarithm [s] (default: 0)",
+        help="time of a change of light, which is linear in its logarithm [s] (default: 0)",
     )
     parser.add_argument("-o", "--out", type=Path, default=Path("my_camera.yaml"), metavar="YAML")
     parser.add_argument(
@@ -51,13 +51,13 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         action="append",
         default=[],
         metavar=("FILE", "LUX"),
-        help="the same still surface in other light; may be repeated. Rates of all pixels by light go to a "
+        help="the still surface at another illuminance; may be repeated. The rates of all pixels go to a "
         ".npz beside the settings, which take noise from it",
     )
-    parser.add_argument("--size", metavar="WxH", help="of the sensor, where the file does not say it")
-    parser.add_argument("--sensor", default="", metavar="NAME", help="event camera, of files with several")
+    parser.add_argument("--size", metavar="WxH", help="resolution, for files that do not give it")
+    parser.add_argument("--sensor", default="", metavar="NAME", help="event camera, for files with several")
     parser.add_argument("--repeats", type=int, default=8, help="simulations for the errors (default: 8)")
-    parser.add_argument("--overwrite", action="store_true", help="replace files that are there")
+    parser.add_argument("--overwrite", action="store_true", help="replace existing files")
     parser.set_defaults(command=_fit)
 
 

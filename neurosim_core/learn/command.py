@@ -39,93 +39,91 @@ def _add_learn(commands: _Commands) -> None:
     folder: dict[str, Any] = {"type": Path, "metavar": "DIR"}
     run = "eval: folder of a run, or depth.pt, ...; rate: a task"
     add("run", "dagger ppo eval transfer network rate", run, nargs="?", type=Path, metavar="RUN")
-    add("--out", "dagger ppo dense", "where to leave the run (default: runs/TASK)", **folder)
+    add("--out", "dagger ppo dense", "folder of the run (default: runs/TASK)", **folder)
     device = "auto, cpu, cuda:0, ... (default: auto; eval: as trained)"
     add("--device", "dagger ppo dense eval transfer rate", device)
-    worlds = "worlds of the student, of `eval`, or to learn depth or flow from"
+    worlds = "number of worlds to train the student, to evaluate, or to learn depth or flow in"
     add("--worlds", "dagger ppo dense eval transfer rate", worlds, **number)
-    add("--pixels", "dagger ppo rate", "width and height of the camera (default: as the task says)", **number)
-    surface = "how the student sees events (default: as the task says)"
+    add("--pixels", "dagger ppo rate", "width and height of the camera (default: by task)", **number)
+    surface = "event representation for the student (default: by task)"
     add("--surface", "dagger ppo", surface, choices=("leaky", "time", "counts", "voxels"))
-    add("--seed", "dagger ppo dense", "of everything (default: 0)", type=int, default=0)
+    add("--seed", "dagger ppo dense", "seed of all random numbers (default: 0)", type=int, default=0)
     add("--seeds", "dagger ppo", "train with N seeds from --seed on; with --ray", default=1, **number)
     add("--workers", "dagger ppo", "processes that train one policy; with --ray", default=1, **number)
     ray = (
-        "a Ray cluster (local, host:port; auto, the default: one that runs here): one training for each "
-        "of --seeds; depth, flow: the flights of --live"
+        "address of a Ray cluster (local, host:port; auto, the default: one on this host): one training "
+        "per seed; depth, flow: the flights of --live"
     )
     add("--ray", "dagger ppo dense", ray, nargs="?", const="auto", metavar="ADDRESS")
     add("--wandb", "dagger ppo", "send what TensorBoard gets to Weights & Biases", action="store_true")
     algorithm = (
-        "dagger: imitate a teacher (default); ppo: from scratch, with a memory, without a teacher "
-        "(rate: how fast that is, too)"
+        "dagger: imitate a teacher (default); ppo: train a recurrent policy without a teacher "
+        "(also of `rate`)"
     )
     add("--algorithm", "dagger ppo rate", algorithm, choices=("dagger", "ppo"), default="dagger")
-    add("--teacher-iterations", "dagger", "of PPO", **number)
-    add("--student-iterations", "dagger ppo", "of the student", **number)
-    add("--resume", "dagger ppo", "go on from the checkpoint in --out", action="store_true")
-    scenes = "eval: where to fly: seen, unseen (default), or the file of a scene"
+    add("--teacher-iterations", "dagger", "PPO iterations of the teacher", **number)
+    add("--student-iterations", "dagger ppo", "iterations of the student", **number)
+    add("--resume", "dagger ppo", "resume from the checkpoint in --out", action="store_true")
+    scenes = "eval: scenes: seen, unseen (default), or the file of a scene"
     add("--scenes", "eval transfer", scenes, default="unseen")
-    add("--speed", "eval", "eval: at which all episodes begin [m/s]", type=float, metavar="M_S")
-    add("--blind", "eval", "eval: without events as well", action="store_true")
-    transfer = "eval: with noise, other lenses, thresholds and dynamics than it was trained with"
+    add("--speed", "eval", "eval: initial speed of all episodes [m/s]", type=float, metavar="M_S")
+    add("--blind", "eval", "eval: also without events", action="store_true")
+    transfer = "eval: with noise, and with other lenses, thresholds and dynamics than in training"
     add("--transfer", "transfer", transfer, action="store_true")
     randomise = (
-        "what episodes of training draw: as the task says for training (default on a GPU), "
-        "as its tests do, or nothing"
+        "randomisation of training episodes: that of the task for training (default on a GPU), "
+        "that of its tests, or none"
     )
     add("--randomise", "dagger ppo", randomise, choices=("training", "tests", "none"))
     dense = learn.add_argument_group("depth, flow, pretrain")
     add("--data", "dense", "a data set to learn from", dense, **folder)
-    add("--live", "dense", "or processes that fly meanwhile", dense, default=0, **number)
-    fly_device = "of the worlds, which fly meanwhile: cuda:1, ... (default: --device)"
+    add("--live", "dense", "or number of processes that fly during training", dense, default=0, **number)
+    fly_device = "device of the worlds: cuda:1, ... (default: --device)"
     add("--fly-device", "dense", fly_device, dense, metavar="DEVICE")
     add("--test", "dense network", "a data set to test on", dense, **folder)
-    add("--minutes", "dense", "how long (default: 3)", dense, type=float, default=3.0, metavar="M")
-    add("--size", "dense", "of flights (default: 48)", dense, type=int, default=48, metavar="PX")
-    backbone = "begin with the weights of another network, such as pretrain.pt"
+    add("--minutes", "dense", "training time [min] (default: 3)", dense, type=float, default=3.0, metavar="M")
+    add("--size", "dense", "image size of flights (default: 48)", dense, type=int, default=48, metavar="PX")
+    backbone = "network whose weights to begin with, such as pretrain.pt"
     add("--backbone", "dense", backbone, dense, metavar="FILE")
     learn.set_defaults(command=partial(_learn, learn, uses), many_blas_threads=True)
 
 
 def _add_deploy(commands: _Commands) -> None:
     deploy = commands.add_parser(
-        "deploy", help="fly a simulator or a vehicle by a trained policy, over Cortex"
+        "deploy", help="fly a simulator or a vehicle with a trained policy, over Cortex"
     )
-    deploy.add_argument("policy", help="policy.onnx of a run, or the name of one that comes with this: hover")
-    deploy.add_argument("--vehicle", default="drone", metavar="NAME", help="which one (default: drone)")
+    deploy.add_argument("policy", help="policy.onnx of a run, or the name of an included policy: hover")
+    deploy.add_argument("--vehicle", default="drone", metavar="NAME", help="vehicle (default: drone)")
+    deploy.add_argument("--events", default="events", metavar="NAME", help="event camera (default: events)")
     deploy.add_argument(
-        "--events", default="events", metavar="NAME", help="its event camera (default: events)"
-    )
-    deploy.add_argument(
-        "--print-config", action="store_true", help="print settings for `neurosim serve`, and stop"
+        "--print-config", action="store_true", help="print settings for `neurosim serve`, and exit"
     )
     deploy.add_argument(
         "--ros",
         nargs="?",
         const="auto",
         choices=("auto", "rclpy", "dds"),
-        help="the vehicle is in ROS 2: events and odometry come from there, AttitudeTarget goes there",
+        help="the vehicle is in ROS 2: receive its events and odometry, send it AttitudeTarget",
     )
     deploy.add_argument(
         "--max-thrust",
         type=float,
         metavar="N",
-        help="--ros: what a thrust of 1 is [N] (default: all of the vehicle it was trained with)",
+        help="--ros: force of a thrust of 1 [N] (default: the largest of the vehicle in training)",
     )
-    deploy.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
+    deploy.add_argument("--duration", type=float, metavar="S", help="simulated time after which to stop [s]")
     deploy.set_defaults(command=_deploy, many_blas_threads=True)
 
 
 def _add_predict(commands: _Commands) -> None:
     predict = commands.add_parser(
-        "predict", help="tell depth or flow from the events of a running simulator, over Cortex"
+        "predict", help="estimate depth or flow from the events of a running simulator, over Cortex"
     )
     predict.add_argument("network", type=Path, help="depth.pt or flow.pt of `neurosim learn`")
-    predict.add_argument("--vehicle", default="drone", metavar="NAME", help="which one (default: drone)")
-    predict.add_argument("--events", default="events", metavar="NAME", help="its camera (default: events)")
-    predict.add_argument("--device", default="cpu", help="of the network: cpu, cuda:0, ... (default: cpu)")
-    predict.add_argument("--duration", type=float, metavar="S", help="stop after so much simulated time [s]")
+    predict.add_argument("--vehicle", default="drone", metavar="NAME", help="vehicle (default: drone)")
+    predict.add_argument("--events", default="events", metavar="NAME", help="event camera (default: events)")
+    predict.add_argument("--device", default="cpu", help="device: cpu, cuda:0, ... (default: cpu)")
+    predict.add_argument("--duration", type=float, metavar="S", help="simulated time after which to stop [s]")
     predict.set_defaults(command=_predict, many_blas_threads=True)
 
 
@@ -313,19 +311,19 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
     speed = "" if arguments.speed is None else f"-{arguments.speed:g}m_s"
     run = _run_of(arguments)
-    film = run / f"{Path(arguments.scenes).stem}{speed}.webp"
+    animation = run / f"{Path(arguments.scenes).stem}{speed}.webp"
     for name, evaluation in evaluate_run(
         run,
         scenes=arguments.scenes,
         device=arguments.device,
         worlds=arguments.worlds,
         speed_m_s=arguments.speed,
-        film=film,
+        animation=animation,
     ):
         print(f"{arguments.scenes} scenes, {name}: {evaluation}")
         if not arguments.blind:
             break
-    print(f"wrote {film}: the first of the episodes")
+    print(f"wrote {animation}: the first of the episodes")
     return 0
 
 

@@ -22,36 +22,36 @@ Teacher = Callable[[torch.Tensor], torch.Tensor]
 
 @dataclass(frozen=True, kw_only=True)
 class DaggerConfig:
-    """How a student is trained."""
+    """Training of a student that imitates a teacher (DAgger)."""
 
     worlds: int = 96
     iterations: int = 130
     horizon: int = 40
-    """Steps of each world in an iteration, and how far back gradients go."""
+    """Steps of each world in an iteration, and of backpropagation through time."""
     replay: int = 3
-    """Iterations that are learnt from: this one and those before."""
+    """Number of iterations to learn from: the present one and those before."""
     updates: int = 6
     """Gradient steps in an iteration."""
     batch: int = 48
-    """Stretches of flight (`horizon` steps of a world) in a gradient step."""
+    """Sequences (`horizon` steps of a world) in a gradient step."""
     learning_rate: float = 1.5e-3
-    """At first; it falls to zero as a cosine."""
+    """Initial learning rate; it falls to zero along a cosine."""
     lead: float = 0.3
-    """Share of the training in which the teacher flies less and less often,"""
+    """Share of the training in which the teacher flies less and less often."""
     lead_last: float = 0.2
-    """and share of the worlds that it flies from then on."""
+    """Share of the worlds that the teacher flies after that."""
     disturbance: float = 0.2
-    """What is added to the teacher's actions where it flies: it shows how to recover. Mean over the worlds of
+    """Noise on the teacher's actions where it flies, so that it shows how to recover: mean over the worlds of
     the standard deviation, which is between 0 and twice as much."""
     disturbance_s: float = 0.25
-    """Correlation time of it [s]."""
+    """Correlation time of this noise [s]."""
     hint_weight: float = 2.0
-    """Of the error of the estimated velocity, against that of the action."""
+    """Weight of the error of the estimated velocity, relative to that of the action."""
     gradient_max: float = 1.0
     hidden: int = 128
-    """Width of the student's GRU,"""
+    """Width of the student's GRU."""
     widths: tuple[int, ...] = (32, 48, 48, 48, 48)
-    """and channels of its convolutions."""
+    """Channels of its convolutions."""
 
 
 class Dagger:

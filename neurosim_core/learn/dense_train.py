@@ -40,47 +40,47 @@ _TEST_SEED = 1_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class DenseConfig:
-    """How it is learned."""
+    """Training of a network that predicts a value per pixel from events."""
 
     task: str = "depth"
-    """One of `HEADS`."""
+    """Predicted quantity, one of `HEADS`."""
     window_s: float = 0.05
     """Length of a window of events [s]."""
     bins: int = 5
-    """Channels of a voxel."""
+    """Channels of a voxel grid of events."""
     channels: int = 16
-    """Of the network's finest level."""
+    """Channels of the network's finest level."""
     sequence: int = 4
-    """Consecutive windows through which gradients go back."""
+    """Consecutive windows of backpropagation through time."""
     batch: int = 8
-    """Sequences of a step."""
+    """Sequences in a gradient step."""
     rate: float = 2e-3
     """Highest learning rate; it rises over the first tenth of the time and falls along a cosine."""
     minutes: float = 3.0
-    """How long to train [min]; waiting for the first windows is not counted."""
+    """Training time [min]; waiting for the first windows is not counted."""
     steps: int | None = None
-    """How many steps to train, however long they take; None: as `minutes` says."""
+    """Number of gradient steps, however long they take; None: as many as fit in `minutes`."""
     capacity: int = 20_000
-    """Windows that are kept to be seen again; of more, the oldest go."""
+    """Capacity of the replay buffer [windows]; beyond it, the oldest are dropped."""
     reuse: float = 4.0
-    """Worlds fly on when their windows have been seen so often, on average."""
+    """Worlds fly on when their windows have been used this often, on average."""
     renders: int | None = 2
-    """Of the event camera in a window, of worlds; None: as in other flights, ten in 50 ms. From two, depth is
-    learned as well in the same time (docs/data.md)."""
+    """Renders of the event camera per window, in worlds; None: as in other flights, ten in 50 ms. From two,
+    depth is learned as well in the same time (docs/data.md)."""
     threshold_spread: float = 0.25
-    """Each world draws its thresholds up to this share above the nominal ones, or below, in each flight."""
+    """Relative half-width of the thresholds that each world draws around the nominal ones, in each flight."""
     size_px: int = 48
-    """Of the pictures of all flights that are flown here [px]."""
+    """Width and height of the pictures of all flights that are flown here [px]."""
     test_flights: int = 8
-    """Flights in scenes that are not trained in."""
+    """Number of flights in scenes that are not trained in."""
     backbone: str | None = None
-    """File of a network whose weights to begin with; see `DenseNet.take_backbone`."""
+    """File of a network whose weights initialise the backbone; see `DenseNet.take_backbone`."""
     device: str = "cpu"
-    """Of the network."""
+    """Device of the network."""
     fly_device: str | None = None
-    """Of worlds; None: that of the network. Worlds on another device fly while the network learns."""
+    """Device of the worlds; None: that of the network. On another device, worlds fly during learning."""
     seed: int = 0
-    """Of the order, the weights and the flights."""
+    """Seed of the order, the weights and the flights."""
 
     @property
     def head(self) -> Head:

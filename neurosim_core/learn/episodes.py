@@ -58,7 +58,7 @@ class StartConfig:
     clearance_m: float = 0.6
     """Least distance to the scene at the start and at the goal [m]."""
     speed_m_s: tuple[float, float] = (0.0, 0.0)
-    """Range of speeds, in any direction, but with half of the vertical part [m/s]."""
+    """Range of the speed, in any direction with half of the vertical part [m/s]."""
     tilt_max_rad: float = 0.0
     """Largest tilt [rad]."""
     rate_max_rad_s: float = 0.0

@@ -1,4 +1,4 @@
-"""Evaluation of a policy: an episode in each world, in scenes that it may not have seen; films of one."""
+"""Evaluation of a policy: an episode in each world, in scenes that it may not have seen; animations."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from neurosim_core.packets import Packet
 
 EPISODE_SEED = 1_000_000
 """Of the episodes that policies are evaluated in."""
-_FILM_HEIGHT_PX = 220
-"""Of the picture of a film; its view is that of the event camera."""
+_IMAGE_HEIGHT_PX = 220
+"""Height of the colour picture of an animation; its view is that of the event camera."""
 
 Actor = Callable[[Observations, torch.Tensor], torch.Tensor]
 """Returns actions, given observations and which worlds begin an episode (bool, [N])."""
@@ -116,10 +116,10 @@ def _interval(happened: torch.Tensor) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def film_sensors(task: Task) -> dict[str, Any]:
-    """Return the sensors, besides the event camera, that an environment needs to be filmed."""
-    width_px = round(_FILM_HEIGHT_PX * task.camera["width"] / task.camera["height"])
-    lens = {**task.camera, "width": width_px, "height": _FILM_HEIGHT_PX}
+def recording_sensors(task: Task) -> dict[str, Any]:
+    """Return the sensors, besides the event camera, that an environment needs for `record_episode`."""
+    width_px = round(_IMAGE_HEIGHT_PX * task.camera["width"] / task.camera["height"])
+    lens = {**task.camera, "width": width_px, "height": _IMAGE_HEIGHT_PX}
     return {
         "rgb": {"kind": "rgb", "rate_hz": task.rate_hz, "lens": lens, "mount": dict(task.mount)},
         "odometry": {"kind": "odometry", "rate_hz": task.rate_hz},
@@ -127,10 +127,10 @@ def film_sensors(task: Task) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def film_episode(env: Env, actor: Actor, file: Path, *, seed: int = EPISODE_SEED) -> None:
-    """Fly an episode in the first world, and leave a film or a recording of it.
+def record_episode(env: Env, actor: Actor, file: Path, *, seed: int = EPISODE_SEED) -> None:
+    """Fly an episode in the first world, and write an animation or a recording of it.
 
-    `env`: where, with the sensors of `film_sensors`. `file`: a film (.webp, .gif) or a recording (.h5).
+    `env`: with the sensors of `recording_sensors`. `file`: an animation (.webp, .gif) or a recording (.h5).
     """
     with saved_flight(file, env.sim.model) as write:
         observations, _ = env.reset(seed=seed)

@@ -20,7 +20,7 @@ CARD = "neurosim"
 CAMERA = "events"
 """Name of the event camera in `pilot_settings`."""
 _COLOUR = {"kind": "rgb", "rate_hz": 20.0, "lens": {"width": 320, "height": 240, "horizontal_fov_rad": 1.5}}
-"""What a flight is filmed with."""
+"""Sensors of an animation of a flight."""
 _VECTOR_SIZE = 10
 """Numbers that a policy sees besides events: gravity, body rates, the last action."""
 
@@ -208,7 +208,7 @@ def fly_policy(
         seed: Of the throw: 1 m/s in some direction.
         overrides: Further settings by dotted key, such as {"scene.seed": 3}.
         save: Record the flight to this file, with a colour camera beside what the policy sees;
-            where it ends in .webp or .gif, a film of it.
+            where it ends in .webp or .gif, an animation of it.
         say: Told how it goes, line by line.
     """
     from neurosim_core import sim

@@ -18,7 +18,7 @@ _RATE_STEP, _RATE_LEAST, _RATE_MOST = 1.2, 0.05, 4.0
 
 @dataclass(frozen=True, kw_only=True)
 class PpoConfig:
-    """How a teacher is trained."""
+    """Training by proximal policy optimisation (PPO)."""
 
     worlds: int = 256
     iterations: int = 80
@@ -27,13 +27,13 @@ class PpoConfig:
     epochs: int = 4
     minibatches: int = 4
     learning_rate: float = 1.5e-3
-    """At first; it falls to a tenth."""
+    """Initial learning rate; it falls to a tenth."""
     divergence: float = 0.0
     """How much a teacher should change in an iteration (KL): where it changes more than twice or less than
     half as much, the learning rate is divided or multiplied by 1.2 from then on. 0: it only falls."""
     discount: float = 0.98
     reward_scale: float = 1.0
-    """What rewards are multiplied with: large errors of the critic would drown the gradient of the actor."""
+    """Factor on rewards: large errors of the critic would drown the gradient of the actor."""
     trace: float = 0.95
     """Lambda of the generalised advantage estimate."""
     clip: float = 0.2

@@ -23,19 +23,19 @@ from neurosim_core.learn.task import Observations
 
 @dataclass(frozen=True, kw_only=True)
 class RecurrentPpoConfig(PpoConfig):
-    """How a policy with a memory is trained."""
+    """Training of a recurrent policy by PPO."""
 
     horizon: int = 32
-    """Steps of each world in an iteration, and how far back gradients go."""
+    """Steps of each world in an iteration, and of backpropagation through time."""
     learning_rate: float = 6e-4
     reward_scale: float = 0.1
     gradient_max: float = 1.0
     hint_weight: float = 1.0
-    """Of the error of the estimate (`Task.hint`), which the policy learns besides."""
+    """Weight of the error of the estimate (`Task.hint`), which the policy learns in addition."""
     hidden: int = 128
-    """Width of the GRU,"""
+    """Width of the GRU."""
     widths: tuple[int, ...] = (32, 48, 48, 48, 48)
-    """and channels of the convolutions."""
+    """Channels of the convolutions."""
 
 
 class _EventActorCritic(Critic):

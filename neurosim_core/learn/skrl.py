@@ -79,7 +79,7 @@ class SkrlEnv(Wrapper):  # type: ignore[misc]
         return _flat(self._now, self._critic)
 
     def render(self, *_: Any, **__: Any) -> None:
-        """Show nothing; `learn.evaluate.film_episode` films one."""
+        """Show nothing; `learn.evaluate.record_episode` makes an animation."""
 
     def close(self) -> None:
         """Nothing to close: memory is freed with the object."""

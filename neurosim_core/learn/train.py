@@ -27,8 +27,8 @@ from neurosim_core.learn.env import Env, find_task, make_env
 from neurosim_core.learn.evaluate import (
     Evaluation,
     evaluate_policy,
-    film_episode,
-    film_sensors,
+    record_episode,
+    recording_sensors,
     student_actor,
     teacher_actor,
 )
@@ -52,28 +52,28 @@ _SEEDS_APART = 1 << 20
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """What is trained, and how."""
+    """Task and algorithm of a training."""
 
     task: str
     device: str = "auto"
     seed: int = 0
     teacher: PpoConfig = dataclasses.field(default_factory=PpoConfig)
     student: DaggerConfig | RecurrentPpoConfig = dataclasses.field(default_factory=DaggerConfig)
-    """Imitates the teacher, or learns by PPO from scratch: then there is no teacher."""
+    """Imitates the teacher, or learns by PPO from scratch, without a teacher."""
     pixels: int | None = None
-    """Width and height of the event camera [px]; None: as the task says."""
+    """Width and height of the event camera [px]; None: those of the task."""
     rate_hz: float | None = None
-    """Steps a second; time constants of surfaces are stretched with the step. None: as the task says."""
+    """Steps per second [Hz]; time constants of surfaces scale with the step. None: that of the task."""
     surface: str | None = None
-    """Kind of the event surfaces (`surfaces.SURFACES`); None: as the task says."""
+    """Kind of the event surfaces (`surfaces.SURFACES`); None: that of the task."""
     randomise: str = "training"
-    """What episodes draw: as `Task.training` says (`training`), as tests do (`tests`): what few steps can
-    learn, or nothing (`none`)."""
+    """Randomisation of episodes. `training`: as `Task.training` says; `tests`: so little that few steps can
+    learn it; `none`: nothing is drawn."""
     block: int = _BLOCK
     """Iterations from one checkpoint to the next."""
     evaluation_worlds: int = 96
     wandb: bool = False
-    """Send what TensorBoard gets to Weights & Biases, too (package `wandb`)."""
+    """Whether Weights & Biases gets what TensorBoard gets (package `wandb`)."""
 
     def __post_init__(self) -> None:
         if self.randomise not in _RANDOMISE:
@@ -347,7 +347,7 @@ def evaluate_run(
     device: str | None = None,
     worlds: int | None = None,
     speed_m_s: float | None = None,
-    film: Path | None = None,
+    animation: Path | None = None,
 ) -> Iterator[tuple[str, Evaluation]]:
     """Yield how the student of a run does: first with events (`events`), then without (`blind`).
 
@@ -357,7 +357,7 @@ def evaluate_run(
         device: None: as in the training.
         worlds: Episodes; None: as configured.
         speed_m_s: At which all episodes begin [m/s]; None: as the task says.
-        film: Where to leave a film of the first episode, with events (.webp, .gif); None: none is made.
+        animation: Where to write an animation of the first episode (.webp, .gif); None: none is made.
     """
     config = read_config(folder)
 
@@ -370,9 +370,9 @@ def evaluate_run(
     where: Any = scenes if scenes in ("seen", "unseen") else [scenes]
     env = make(worlds=worlds or config.evaluation_worlds, scenes=where)
     policy = load_student(folder, env.device)
-    if film is not None:
-        filmed = make(worlds=1, models=env.sim.models[:1], sensors=film_sensors(env.task))
-        film_episode(filmed, student_actor(policy, filmed), film)
+    if animation is not None:
+        recorded = make(worlds=1, models=env.sim.models[:1], sensors=recording_sensors(env.task))
+        record_episode(recorded, student_actor(policy, recorded), animation)
     for blind in (False, True):
         actor = student_actor(policy, env, blind=blind)
         yield "blind" if blind else "events", evaluate_policy(env, actor)
@@ -411,7 +411,7 @@ def train(
         say(f"teacher: {training.evaluate_teacher()}")
     export_onnx(training.student, make_card(training.env, training.config.task), folder / "policy.onnx")
     found = {}
-    for name, evaluation in evaluate_run(folder, film=folder / "evaluation.webp"):
+    for name, evaluation in evaluate_run(folder, animation=folder / "evaluation.webp"):
         say(f"student, unseen scenes, {name}: {evaluation}")
         found[name] = evaluation
     values = {name: dataclasses.asdict(evaluation) for name, evaluation in found.items()}

@@ -65,7 +65,7 @@ class CommandCounts(NamedTuple):
 
 
 class CommandSubscriber:
-    """Reads the commands of one vehicle, in every mode, in the thread that flies.
+    """Reads the commands of one vehicle, in every mode, in the simulation thread.
 
     Attributes:
         missed: The last command that did not fit what was waited for; None if there was none.

@@ -15,36 +15,36 @@ Delay = Annotated[float, Field(ge=0.0, le=5.0)]
 
 
 class LiveConfig(BaseConfig):
-    """How time passes, and what happens when a controller or the machine is too slow."""
+    """Timing of a live run, and the response to a slow controller or machine."""
 
     mode: LiveMode = "streaming"
     """streaming: time passes whether commands arrive or not; each command is held until the next. lockstep:
     every control period waits for its command, so that a flight is bit-identical on every machine."""
     real_time_factor: Annotated[float, Field(ge=0.0, le=1000.0)] = 1.0
-    """streaming: simulated over wall-clock time; 0: as fast as possible."""
+    """streaming: ratio of simulated to wall-clock time; 0: as fast as possible."""
     overrun: Literal["slow", "drop"] = "slow"
-    """streaming: what gives way when the machine is too slow. slow: time; drop: camera frames. /status counts
-    both."""
+    """streaming: response when the machine is too slow. slow: simulated time slows down; drop: camera frames
+    are dropped. /status counts both."""
     command_timeout_s: Annotated[float, Field(gt=0.0, le=1e6)] = 0.2
     """Age at which a command is stale [simulated s]; the fail-safe then flies until the next command."""
     fail_safe: FailSafe = "hover"
-    """hover: stay where the command became stale; cut: rotors at their lowest speed; hold: keep the stale
-    command."""
+    """Response to a stale command. hover: stay where the command became stale; cut: rotors at their lowest
+    speed; hold: keep the stale command."""
     begin: Literal["command", "hover"] = "command"
-    """streaming: when time begins. command: with the first command; hover: at once, and each vehicle hovers
-    where it starts until its first command."""
+    """streaming: start of simulated time. command: at the first command; hover: at once, and each vehicle
+    hovers where it starts until its first command."""
     command_deadline_s: Annotated[float, Field(gt=0.0, le=1e6)] = 30.0
     """lockstep: longest wait for a command before the run ends with an error [wall-clock s]. The wait for the
     first command of a run has no limit."""
     command_every: Annotated[int, Field(ge=1)] = 1
-    """lockstep: control periods for each command; 4 at a control rate of 200 Hz waits for 50 commands a
+    """lockstep: number of control periods per command; 4 at a control rate of 200 Hz waits for 50 commands a
     second, and the inner loops still run at 200 Hz."""
     run_on: bool = True
-    """Continue after `duration_s`, until stopped. false: end there."""
+    """Whether the run continues after `duration_s`, until it is stopped; false: it ends there."""
 
 
 class LinkConfig(BaseConfig):
-    """What a simulated link does to messages between simulator and controller, in simulated time; seeded.
+    """A simulated link between simulator and controller, in simulated time; random draws are seeded.
 
     A link keeps the order of its messages: a delayed message delays those behind it.
     """
@@ -52,17 +52,17 @@ class LinkConfig(BaseConfig):
     latency_s: Delay = 0.0
     """Delay of every message [s]."""
     jitter_s: Delay = 0.0
-    """Further delay, uniform in [0, jitter_s] [s]."""
+    """Additional random delay, uniform in [0, jitter_s] [s]."""
     loss: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """Share of messages that never arrive."""
+    """Probability that a message is lost, from 0 to 1."""
     bandwidth_bytes_s: Annotated[float, Field(gt=0.0)] | None = None
-    """Bytes a second; a message occupies the link for its size over this. null: unlimited."""
+    """Bandwidth [byte/s]; a message occupies the link for its size over this. null: unlimited."""
     queue_s: Annotated[float, Field(gt=0.0, le=1e6)] = 1.0
     """Longest wait for bandwidth [s]; a message that would wait longer is lost at once."""
     clock_offset_s: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
-    """How far the sensor's clock is ahead of simulated time at stamp 0 [s]; not for `command`."""
+    """Lead of the sensor's clock over simulated time at stamp 0 [s]; not for `command`."""
     clock_drift_ppm: Annotated[float, Field(ge=-1e5, le=1e5)] = 0.0
-    """How much faster the sensor's clock runs [1e-6]; not for `command`."""
+    """Relative excess of the rate of the sensor's clock [ppm]; not for `command`."""
 
     @property
     def delivers_at_once(self) -> bool:

@@ -191,9 +191,9 @@ class RemoteRendererConfig(RendererConfig):
 
     kind: Literal["remote"] = "remote"
     topic: Annotated[str, Field(pattern=r"^(/[A-Za-z0-9_]+)+$")] = "/renderer"
-    """Where it listens: requests go to TOPIC/request, frames come from TOPIC/frames."""
+    """Topic prefix of the renderer: requests go to TOPIC/request, frames come from TOPIC/frames."""
     timeout_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 10.0
-    """Longest wait for frames, and for the renderer to be there [wall-clock s]."""
+    """Longest wait for the renderer to appear, and for its frames [wall-clock s]."""
 
     scene_type = RemoteScene
 

@@ -21,7 +21,7 @@ class CortexSinkConfig(SinkConfig):
 
     kind: Literal["cortex"] = "cortex"
     wait_s: Annotated[float, Field(ge=0.0, le=3600.0)] = 0.0
-    """How long the flight waits for a subscriber of each sensor before it begins, at most [s]."""
+    """Longest wait for a subscriber of each sensor before the flight begins [wall-clock s]."""
 
     is_live = False
 
@@ -69,7 +69,7 @@ class CortexSink:
             publisher.publish(self._to_message(packet, frame_id=frame_id))
 
     def close(self, *, complete: bool = True) -> None:
-        """Deliver what is on its way, and close the topics."""
+        """Deliver what is in flight, and close the topics."""
         for publisher, _ in self._publishers.values():
             publisher.close()
         self._node.close()

@@ -183,7 +183,7 @@ class _InlineExecutor(futures.Executor):
 
 
 class CameraThread:
-    """Renders batches in order, and keeps their packets until `take`. For the thread that flies.
+    """Renders batches in order, and keeps their packets until `take`. For the simulation thread.
 
     On a CUDA device that thread renders inline, since only one thread can record CUDA graphs.
 

@@ -28,7 +28,7 @@ _SPARE_PERIODS = 32
 
 
 class VehicleNode:
-    """Everything that belongs to one vehicle. For the thread that flies.
+    """Everything that belongs to one vehicle. For the simulation thread.
 
     In lockstep `begin_step` flies a control period, cameras included. In streaming `fly` flies one, and the
     cameras look at its batches later (`streaming.py`).

@@ -1,6 +1,6 @@
 """A recording that a process of its own writes, and more processes, forked from that one, compress.
 
-All this would take Python's interpreter lock from the thread that flies. Packets go through a socket: as a
+All this would take Python's interpreter lock from the simulation thread. Packets go through a socket: as a
 pickled list, and after it their arrays as they are. Where the stream ends, also because the process that flew
 was killed, the file is closed. Threads could compress, but for the lock: a chunk takes it dozens of times,
 and each time waits for all others. A thread that hands a chunk to a process asks for it thrice.

@@ -49,8 +49,8 @@ _RAYS = wp.constant(16 * RAY_COUNT)
 _FAST = {"fast_math": True}
 """Quotients, roots and logarithms are off by a few units in the last place."""
 Coverage = wp.types.vector(length=6, dtype=int)
-Met = wp.types.vector(length=8, dtype=float)
-MetPair = wp.types.vector(length=9, dtype=float)
+PlaneHit = wp.types.vector(length=8, dtype=float)
+PairSample = wp.types.vector(length=9, dtype=float)
 
 
 @wp.func_native(read_native(__file__, "sample_point", SAMPLES=RAY_COUNT))
@@ -143,9 +143,9 @@ def _classify_block(scene: SceneData, view: ViewData, faces: wp.array3d[int], at
     ...
 
 
-@wp.func_native(read_native(__file__, "meet_part"))
-def _meet_part(scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3) -> Met:
-    """Return where a direction meets the plane of a face."""
+@wp.func_native(read_native(__file__, "intersect_face_plane"))
+def _intersect_face_plane(scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3) -> PlaneHit:
+    """Return where a direction intersects the plane of a face."""
     ...
 
 
@@ -167,8 +167,8 @@ def _block_coverer(timed: bool) -> Any:
     return cover_block
 
 
-@wp.func_native(read_native(__file__, "meet_pair", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
-def _meet_pair(
+@wp.func_native(read_native(__file__, "pair_sample", SAMPLES=SAMPLE_COUNT, MOST=FACE_COUNT_MAX))
+def _pair_sample(
     scene: SceneData,
     place: int,
     alone: wp.bool,
@@ -176,7 +176,7 @@ def _meet_pair(
     own_part: int,
     spread_rad: float,
     rays: PixelRays,
-) -> MetPair:
+) -> PairSample:
     """Return what a pixel sees of a surface; see the file."""
     ...
 
@@ -238,7 +238,7 @@ def _pixel_locator(terms: RenderTerms, *, images: bool, instants: bool) -> wp.Fu
 
 
 def _part_shader(terms: RenderTerms) -> wp.Function:
-    """Return the Warp function that finds the light of a face where a direction meets its plane.
+    """Return the Warp function that finds the light of a face where a direction intersects its plane.
 
     Its parameters: the scene; the face; origin and direction; the width of the footprint [rad]. For baked
     light and filtered textures it is the program of packets on a CPU (`raycast_packets.py`), for one ray.
@@ -263,17 +263,17 @@ def _part_shader(terms: RenderTerms) -> wp.Function:
     shade = surface_shader(terms, beyond=True)
 
     @wp.func
-    def shade_met(scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3, width_rad: float) -> wp.vec3:
-        met = _meet_part(scene, part, origin, toward)
+    def light_of(scene: SceneData, part: int, origin: wp.vec3, toward: wp.vec3, width_rad: float) -> wp.vec3:
+        found = _intersect_face_plane(scene, part, origin, toward)
         hit = Hit()
         hit.face = part
-        hit.t = met[0]
-        hit.u = met[1]
-        hit.v = met[2]
-        hit.normal = wp.vec3(met[3], met[4], met[5])
-        return shade(scene, wp.normalize(toward), origin, width_rad, hit, wp.vec2(met[6], met[7]))
+        hit.t = found[0]
+        hit.u = found[1]
+        hit.v = found[2]
+        hit.normal = wp.vec3(found[3], found[4], found[5])
+        return shade(scene, wp.normalize(toward), origin, width_rad, hit, wp.vec2(found[6], found[7]))
 
-    return shade_met
+    return light_of
 
 
 def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> tuple[wp.Kernel, wp.Kernel, wp.Kernel]:
@@ -393,16 +393,16 @@ def group_kernels(outputs: tuple[str, ...], terms: RenderTerms) -> tuple[wp.Kern
             for step in range((covered[0] + 31) // 32):
                 pair = 32 * step + lane
                 known = wp.min(pair, covered[0] - 1)
-                met = _meet_pair(scene, covered[5], alone, known, part, rays[0, pixel][3], own)
+                sample = _pair_sample(scene, covered[5], alone, known, part, rays[0, pixel][3], own)
                 if pair < covered[0]:
                     light = shade_part(
                         scene,
-                        wp.cast(met[2], int),
-                        wp.vec3(met[6], met[7], met[8]),
-                        wp.vec3(met[3], met[4], met[5]),
-                        footprint_width(met[0]) * met[1],
+                        wp.cast(sample[2], int),
+                        wp.vec3(sample[6], sample[7], sample[8]),
+                        wp.vec3(sample[3], sample[4], sample[5]),
+                        footprint_width(sample[0]) * sample[1],
                     )
-                    _store_pair(covered[5], pair, met[0] * light)
+                    _store_pair(covered[5], pair, sample[0] * light)
                 total = _sum_pairs(covered[5], covered[1], covered[2], step, total)
             whole = float(SAMPLE_COUNT)
             if covered[4] != 0:

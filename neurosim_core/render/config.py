@@ -13,24 +13,24 @@ TextureFilter = Literal["trilinear", "bilinear", "nearest"]
 
 
 class LightingConfig(BaseConfig):
-    """How surfaces are lit: Lambert, hemispheric ambient, the lights of the scene."""
+    """Lighting: Lambertian surfaces, hemispheric ambient light, the lights of the scene."""
 
     mode: Literal["baked", "unshadowed"] = "baked"
-    """`baked`: shadows and ambient occlusion, computed once when the scene is loaded. `unshadowed`: evaluated
-    for each pixel, exact, without shadows."""
+    """`baked`: shadows and ambient occlusion, computed once when the scene is loaded. `unshadowed`: light
+    evaluated for each pixel, exact, without shadows."""
     edge_max_m: float = Field(default=0.5, ge=0.01)
     """`baked`: edges of triangles are split until none is longer [m]; light is linear between their ends."""
     ambient_ray_count: int = Field(default=16, ge=1, le=1024)
-    """`baked`: rays per point and side that look for occluders of the ambient light."""
+    """`baked`: rays per point and side that test for occluders of the ambient light."""
     ambient_radius_m: float = Field(default=1.0, gt=0.0)
-    """`baked`: an occluder further away than this takes no ambient light [m]; nearer ones take more and
-    more."""
+    """`baked`: range of ambient occlusion [m]; nearer occluders take more of the ambient light, farther ones
+    none."""
     interreflection: float = Field(default=0.5, ge=0.0, lt=1.0)
-    """`baked`: mean albedo of occluders; they give back that share of the ambient light that they take."""
+    """`baked`: mean albedo of occluders; they reflect this share of the ambient light that they block."""
     shadow_ray_count: int = Field(default=4, ge=1, le=256)
-    """`baked`: rays per point, side and light that look for what shades it."""
+    """`baked`: rays per point, side and light that test for shadows."""
     light_radius_m: float = Field(default=0.1, gt=0.0)
-    """Radius of the lights [m]: softens shadows, and distances are taken as at least this."""
+    """Radius of the lights [m]: softens shadows; shading takes distances as at least this."""
 
     @model_validator(mode="after")
     def _only_baked_light_has_shadows(self) -> LightingConfig:
@@ -46,52 +46,52 @@ class LightingConfig(BaseConfig):
 
 
 class CandidateListConfig(BaseConfig):
-    """Candidate lists of tiles of 8 x 8 pixels; they change speed, not results."""
+    """Triangles that the rays of a tile of 8 x 8 pixels may hit; lists change speed, not results."""
 
     instants: int = Field(default=32, ge=1, le=256)
     """Consecutive instants of a launch that share a list. More are cheaper as long as the camera turns by
     less than a few tiles within them."""
     face_count_max: int = Field(default=384, ge=1, le=4096)
-    """Capacity of a list: the rays of a tile with more triangles traverse the tree."""
+    """Capacity of a list [triangles]: the rays of a tile with more traverse the tree."""
 
 
 class RenderConfig(BaseConfig):
-    """How pictures are computed, the same for all cameras of a run."""
+    """Rendering of pictures, the same for all cameras of a run."""
 
     cpu_traversal: Literal["auto", "embree", "warp"] = "auto"
     """Library that intersects rays on a CPU device. `embree`: Embree, in packets of rays, several times
     faster. `warp`: Warp kernels. `auto`: Embree where it can be loaded, and Warp with explicit
     `candidate_lists`."""
     candidate_lists: CandidateListConfig | Literal["auto"] | None = "auto"
-    """The rays of a tile of pixels share one search of the tree over several instants: the same pictures and
-    events to the last bit, sooner. `auto`: lists are used on CUDA, where a launch has 8 instants or more of
-    pixels at most 1.5 mrad wide (in the median), 16 or more of 2.5 mrad, or 32 or more of 6 mrad, the lens
-    looks forward, and lists stay short: the square of a pixel's width [rad] times the triangles of the scene,
-    as cut for baked light, is at most 7; and on a CPU without Embree, where the lens looks forward. null:
-    each ray traverses the tree."""
+    """Whether the rays of a tile of pixels share one search of the ray-tracing tree (BVH) over several
+    instants: the same pictures and events to the last bit, sooner. `auto`: lists are used on CUDA, where a
+    launch has 8 instants or more of pixels at most 1.5 mrad wide (in the median), 16 or more of 2.5 mrad, or
+    32 or more of 6 mrad, the lens looks forward, and the square of a pixel's width [rad] times the triangles
+    of the scene, as cut for baked light, is at most 7; and on a CPU without Embree, where the lens looks
+    forward. null: each ray traverses the tree."""
     lighting: LightingConfig = LightingConfig()
-    """How surfaces are lit."""
+    """Lighting of the surfaces."""
     exposure: Literal["auto"] | Annotated[float, Field(gt=0.0)] = "auto"
     """Factor from linear radiance to the linear value 1.0 of an 8-bit picture. `auto`: chosen once from the
     scene. Event cameras do not use it."""
     dark_floor: float = Field(default=1.0e-3, gt=0.0)
-    """Radiance added before the logarithm that event cameras see: what a black surface gives."""
+    """Radiance added before the logarithm that event cameras see: the radiance of a black surface."""
     samples_per_pixel: Literal["adaptive"] | Annotated[int, Field(ge=1, le=64)] = "adaptive"
-    """Rays per pixel. Radiance is their mean in linear light, before the logarithm. `adaptive`: one ray
-    finds the surfaces around a pixel, and 32 points of the pixel tell how much of it each covers; 8 rays
+    """Rays per pixel. Radiance is their mean in linear light, before the logarithm. `adaptive`: one ray finds
+    the surfaces around a pixel, and 32 points of the pixel tell how much of it each covers; 8 rays are cast
     where many small surfaces meet and for moving bodies. It takes 2 to 4 times as long as one ray, and more
     in pictures of 64x64 of a detailed scene. An integer: as many rays in all pixels. With 1, edges alias, and
     a quarter to a half of the events at 346x260 are aliasing. Geometry (depth, range, normal, instance) is
     always that of the ray through the pixel's centre."""
     fill_factor: float = Field(default=1.0, gt=0.0, le=1.0)
-    """Share of a pixel's area that is sensitive to light, a square around its centre."""
+    """Light-sensitive share of a pixel's area, a square around its centre."""
     mip_bias: float = Field(default=0.0, ge=-4.0, le=4.0)
-    """Added to the level of the texture that the footprint of a ray asks for; negative is sharper and
-    aliases."""
+    """Offset of the mip-map level that the footprint of a ray selects; negative values give sharper textures
+    that alias."""
     texture_filter: TextureFilter = "trilinear"
-    """How textures are read. `trilinear`: averaged over the footprint of the ray (mip-mapped). `bilinear`: at
-    full resolution, interpolated between texels; `nearest`: at full resolution, the nearest texel. The latter
-    two alias, which event cameras see as events that no sensor gives."""
+    """Texture lookup. `trilinear`: averaged over the footprint of the ray (mip-mapped). `bilinear`: at full
+    resolution, interpolated between texels; `nearest`: at full resolution, the nearest texel. The latter two
+    alias, and event cameras show the aliasing as events that no real sensor gives."""
 
     @model_validator(mode="after")
     def _candidate_lists_need_warp(self) -> RenderConfig:

@@ -275,7 +275,7 @@ class DoubleSphereConfig(_WideLens):
     xi: float = Field(gt=-1.0, lt=1.0)
     """Distance between the centres of the two spheres."""
     alpha: float = Field(ge=0.0, le=1.0)
-    """Position of the pinhole: a / (1 - a) behind the centre of the second sphere."""
+    """Position of the pinhole: alpha / (1 - alpha) behind the centre of the second sphere."""
 
     @property
     def distortion_coefficients(self) -> tuple[float, ...]:

@@ -25,13 +25,13 @@ def intersect_face(id: wp.uint64, face: int, origin: wp.vec3, ray: wp.vec3) -> w
 @wp.func
 def intersect_scene(scene: SceneData, origin: wp.vec3, ray: wp.vec3) -> Hit:
     """Return the first hit of a ray with what stands still; the ray traverses the tree."""
-    met = intersect_tree(scene.tree, origin, ray, FAR_M)
+    found = intersect_tree(scene.tree, origin, ray, FAR_M)
     hit = Hit()
-    hit.face = wp.cast(met[3], int)
+    hit.face = wp.cast(found[3], int)
     if hit.face >= 0:
-        hit.t = met[0]
-        hit.u = met[1]
-        hit.v = met[2]
+        hit.t = found[0]
+        hit.u = found[1]
+        hit.v = found[2]
         hit.normal = scene.face_normal[hit.face]
     return hit
 
@@ -42,11 +42,11 @@ def intersect_candidate(scene: SceneData, origin: wp.vec3, ray: wp.vec3, face: i
     hit = Hit()
     hit.face = face
     if face >= 0:
-        met = intersect_face(scene.mesh, face, origin, ray)
-        if met[0] >= 0.0:
-            hit.t = met[0]
-            hit.u = met[1]
-            hit.v = met[2]
+        found = intersect_face(scene.mesh, face, origin, ray)
+        if found[0] >= 0.0:
+            hit.t = found[0]
+            hit.u = found[1]
+            hit.v = found[2]
             hit.normal = scene.face_normal[face]
         else:
             hit.face = UNRESOLVED

@@ -65,22 +65,22 @@ class SweepTiming:
 
 
 class ShutterConfig(BaseConfig):
-    """When the lines of a picture are exposed: all at the stamp, unless it says otherwise.
+    """Exposure times of the lines of a picture; by default, all lines are exposed at the stamp.
 
     Lines are rows, or columns, and are read one after the other; the last one is read at the stamp. A line is
     exposed for `exposure_s` until it is read: its light is the mean of as many instants in linear light.
     """
 
     readout_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """Time that reading a picture takes, line by line [s]; 0: a global shutter."""
+    """Time to read a picture, line by line [s]; 0: a global shutter."""
     direction: Literal["down", "up", "right", "left"] = "down"
     """Order in which lines are read: rows downwards or upwards, or columns."""
     exposure_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """How long a line gathers light [s]; 0: pictures without motion blur. Geometry (depth, normal, instance)
-    is that of the middle of the exposure."""
+    """Exposure time of a line [s]; 0: pictures without motion blur. Geometry (depth, normal, instance) is
+    that of the middle of the exposure."""
     exposure_samples: Annotated[int, Field(ge=1, le=256)] = 16
-    """Instants of an exposure, each with a ray per pixel; at least `render.samples_per_pixel`, 16 if it is
-    adaptive and there are several."""
+    """Sampling times in an exposure, each with a ray per pixel; at least `render.samples_per_pixel`, 16 if it
+    is adaptive and there are several."""
 
     @model_validator(mode="after")
     def _keys_have_effect(self) -> ShutterConfig:

@@ -130,7 +130,7 @@ class PyrenderRendererConfig(RendererConfig):
 
 @register("renderer", "synthetic")
 class SyntheticRendererConfig(RendererConfig):
-    """A test card that costs next to nothing, on CPU and CUDA; the scene is not seen."""
+    """A test pattern at almost no cost, on CPU and CUDA; it does not show the scene."""
 
     kind: Literal["synthetic"] = "synthetic"
     scene_type = SyntheticScene
@@ -138,7 +138,7 @@ class SyntheticRendererConfig(RendererConfig):
     only_launches = True
 
     def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
-        """Return what all test cards of a run share."""
+        """Return what all test patterns of a run share."""
         if bodies:
             names = ", ".join(body.name for body in bodies)
             raise ValueError(f"the renderer 'synthetic' sees no bodies, and there are some: {names}")

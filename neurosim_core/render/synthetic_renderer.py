@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined,type-arg,misc,index,call-overload,operator"
-"""A test card instead of a view: pictures at next to no cost, to measure everything else.
+"""A test pattern instead of a view: pictures at almost no cost, to benchmark everything else.
 
 A bright square moves with the camera over a fixed card. A picture is a pure function of the pose: the card is
 drawn once, and each instant restores what the square covered and draws it elsewhere. `rgb` and `depth` begin
@@ -26,7 +26,7 @@ from neurosim_core.scene.srgb import srgb_to_linear
 wp.set_module_options({"enable_backward": False})
 
 OUTPUTS = ("depth", "log_radiance", "rgb")
-"""What a test card has."""
+"""What a test pattern has."""
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
 _BARS = np.array(
@@ -45,7 +45,7 @@ _POSE_IN_DEPTH_PX = wp.constant(7)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SyntheticScene:
-    """The data that all test cards of a run share."""
+    """The data that all test patterns of a run share."""
 
     scene: Scene
     config: RenderConfig
@@ -147,7 +147,7 @@ def _draw(
 
 
 class SyntheticRenderer:
-    """Draws test cards: log radiance without the pose, rgb and depth of `renderer.Renderer`.
+    """Draws test patterns: log radiance without the pose, rgb and depth of `renderer.Renderer`.
 
     `render` neither allocates nor waits for a CUDA device.
     """
@@ -175,7 +175,7 @@ class SyntheticRenderer:
             )
         if lens.width * lens.height < _POSE_IN_RGB_PX:
             raise ValueError(
-                f"a test card needs at least {_POSE_IN_RGB_PX} pixels, got {lens.width} x {lens.height}"
+                f"a test pattern needs at least {_POSE_IN_RGB_PX} pixels, got {lens.width} x {lens.height}"
             )
         device = scene.device
         self._device = device
@@ -253,7 +253,7 @@ class SyntheticRenderer:
 
 
 def read_pose(data: NDArray[Any]) -> NDArray[np.float32]:
-    """Return the pose p_WC [m] and q_WC (xyzw), shape [7], that a test card shows, rgb or depth."""
+    """Return the pose p_WC [m] and q_WC (xyzw), shape [7], that a test pattern shows, rgb or depth."""
     size = 28 if data.dtype == np.uint8 else 7
     return np.frombuffer(np.ravel(data)[:size].tobytes(), dtype=np.float32)
 

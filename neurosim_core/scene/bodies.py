@@ -42,7 +42,7 @@ class SwayConfig(BaseConfig):
     amplitude_m: Vector3 = (0.0, 0.5, 0.0)
     """Largest displacement, a vector in W [m]."""
     frequency_hz: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.5
-    """Swings to and fro a second [Hz]."""
+    """Frequency [Hz]."""
     phase_rad: float = 0.0
     """Phase at t = 0 [rad]."""
 
@@ -53,9 +53,9 @@ class OrbitConfig(BaseConfig):
     radius_m: Annotated[float, Field(ge=0.0, le=1e4)] = 0.5
     """Radius of the circle [m]."""
     rate_hz: Annotated[float, Field(ge=-1000.0, le=1000.0)] = 0.25
-    """Rounds a second [Hz], right-handed about the axis; negative: the other way round."""
+    """Revolutions a second [Hz], right-handed about the axis; negative: the other way round."""
     axis: Vector3 = (0.0, 0.0, 1.0)
-    """Normal of the circle in W, of any length."""
+    """Axis of the circle in W, a vector of any length."""
     phase_rad: float = 0.0
     """Angle at t = 0 [rad], from e1: the world's x axis projected onto the plane of the circle, or its y axis
     where x is within 0.5 rad of the normal."""
@@ -77,16 +77,16 @@ class OrbitConfig(BaseConfig):
 
 
 class MotionConfig(BaseConfig):
-    """The pose of a body as a function of time; parts that are given add up, see `scene.bodies`."""
+    """The pose of a body as a function of time; parts that are given add up."""
 
     position_m: Vector3 = (0.0, 0.0, 0.0)
-    """Origin of the body in W at rest, the middle of its sway and its orbit [m]."""
+    """Origin of the body in W at t = 0, and the centre of its sway and its orbit [m]."""
     rpy_rad: Vector3 = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw at t = 0 [rad]: R = Rz(yaw) Ry(pitch) Rx(roll)."""
     velocity_m_s: Vector3 = (0.0, 0.0, 0.0)
-    """Velocity in W at t = 0, but for sway and orbit [m/s]."""
+    """Velocity in W at t = 0, without sway and orbit [m/s]."""
     acceleration_m_s2: Vector3 = (0.0, 0.0, 0.0)
-    """Constant acceleration in W [m/s^2]; (0, 0, -9.81): the body was thrown."""
+    """Constant acceleration in W [m/s^2]; (0, 0, -9.81): free fall."""
     sway: SwayConfig | None = None
     """A sinusoid along a line; null: none."""
     orbit: OrbitConfig | None = None
@@ -100,16 +100,16 @@ _ABSENT = MotionConfig(position_m=(0.0, 0.0, -1e6))
 
 
 class BodyConfig(BaseConfig):
-    """A rigid body that moves by itself."""
+    """A rigid body with a prescribed motion."""
 
     shape: ShapeConfig = BoxShape()
-    """What it is: {kind: box | sphere | cylinder | mesh, ...}."""
+    """Shape: {kind: box | sphere | cylinder | mesh, ...}."""
     surface: SurfaceConfig | None = None
-    """How it looks: {kind: plain | checker | picture, ...}; null: grey, and a mesh as its file says."""
+    """Appearance: {kind: plain | checker | picture, ...}; null: grey, and a mesh as its file says."""
     motion: MotionConfig = MotionConfig()
-    """Where it is and how it moves."""
+    """Pose as a function of time."""
     present: bool = True
-    """Whether it is in the scene; else it waits out of sight until a live simulator is told to show it."""
+    """Whether it is in the scene; false: it is hidden until a live simulator is told to show it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

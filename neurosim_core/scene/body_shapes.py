@@ -59,11 +59,11 @@ class MeshShape(BaseConfig):
     file: Path
     """glTF, GLB, OBJ, PLY, STL or another format that trimesh reads."""
     unit_m: float | None = Field(default=None, gt=0.0)
-    """Length of one unit of the file [m], 0.001 for millimetres. None: what the file or its format says."""
+    """Length of one unit of the file [m], 0.001 for millimetres. null: what the file or its format says."""
     up_axis: Axis | None = None
-    """Axis of the file that becomes z of the body. None: as for scenes (`MeshSceneConfig.up_axis`)."""
+    """Axis of the file that becomes z of the body. null: as for scenes (`MeshSceneConfig.up_axis`)."""
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Added to every point, after units and axes [m]: brings the point about which it turns to the origin."""
+    """Offset of every point, after units and axes [m]: moves the centre of rotation to the origin."""
 
 
 class PlainSurface(BaseConfig):
@@ -75,11 +75,11 @@ class PlainSurface(BaseConfig):
 
 
 class CheckerSurface(BaseConfig):
-    """Squares of two colours, aligned with the edges of a face; a whole number around what is round."""
+    """Squares of two colours, aligned with the edges of a face; whole squares around round shapes."""
 
     kind: Literal["checker"] = "checker"
     square_m: Length = 0.1
-    """Width of a square [m]; around a sphere or cylinder the nearest that fits."""
+    """Width of a square [m]; around a sphere or cylinder, the nearest that fits a whole number of times."""
     color: Color = (0.8, 0.8, 0.8)
     """Albedo of the square in the corner of a face, linear red, green, blue in [0, 1]."""
     other_color: Color = (0.05, 0.05, 0.05)
@@ -87,13 +87,13 @@ class CheckerSurface(BaseConfig):
 
 
 class PictureSurface(BaseConfig):
-    """A picture that repeats, upright on a face; around a sphere or cylinder a whole number of times."""
+    """A picture that repeats, upright on a face; a whole number of times around round shapes."""
 
     kind: Literal["picture"] = "picture"
     file: Path
     """PNG, JPEG or the like, 8-bit sRGB."""
     width_m: Length = 0.4
-    """Width of the picture on the body [m]; around a sphere or cylinder the nearest that fits."""
+    """Width of the picture on the body [m]; around a sphere or cylinder, the nearest that fits."""
 
 
 ShapeConfig = Annotated[

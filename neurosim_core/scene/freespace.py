@@ -47,14 +47,14 @@ _BESIDE_M = 3.0
 
 
 class FreeSpaceConfig(BaseConfig):
-    """How finely the room in a scene is mapped."""
+    """A map of the distance to the scene, in which paths are planned."""
 
     voxel_m: float = Field(default=0.1, ge=1e-6)
-    """Spacing of the distance grid [m]."""
+    """Edge length of a voxel of the map [m]."""
     voxel_count_max: int = Field(default=8_000_000, ge=1_000)
-    """Most voxels (4 bytes each); a larger scene gets coarser ones, and a note says so."""
+    """Largest number of voxels, 4 bytes each; a larger scene gets coarser ones, and a note says so."""
     seed_m: Vector3 | None = None
-    """A point in the space to fly in [m]; null: the one that the scene knows, else one is found."""
+    """A point in the space to fly in [m]; null: the `inside_m` of the scene, else a search finds one."""
 
 
 @wp.struct

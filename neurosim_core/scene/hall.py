@@ -30,11 +30,11 @@ class BoxConfig(BaseConfig):
     """A box in a hall."""
 
     position_m: Vector3
-    """Its middle, in the world [m]."""
+    """Centre in the world [m]."""
     size_m: tuple[Length, Length, Length]
-    """Its edges along its own x, y and z [m]."""
+    """Edge lengths along its own x, y and z [m]."""
     yaw_rad: float = 0.0
-    """Its turn about z [rad]."""
+    """Rotation about z [rad]."""
 
 
 @register("scene", "hall")
@@ -44,13 +44,13 @@ class HallConfig(SceneConfig):
     kind: Literal["hall"] = "hall"
     """A hall with boxes."""
     size_m: tuple[Length, Length, Length] = (20.0, 12.0, 4.0)
-    """Its edges along x, y and z [m]."""
+    """Edge lengths along x, y and z [m]."""
     boxes: tuple[BoxConfig, ...] = ()
-    """What stands or hangs in it; they may cut each other."""
+    """Boxes that stand or hang in it; they may intersect each other."""
     seed: int = Field(default=0, ge=0)
-    """Chooses colours and patterns."""
+    """Seed of colours and patterns."""
     inside_m: Vector3 | None = None
-    """A point in free space [m]; None: one is looked for."""
+    """A point in free space [m]; null: a search finds one."""
 
     def load(self, *, pictures: bool = True) -> Scene:
         """Build the hall; pictures are painted when they are looked at."""

@@ -51,24 +51,24 @@ class MeshSceneConfig(SceneConfig):
     file: Path
     """glTF, GLB, OBJ, PLY, STL or another format that trimesh reads."""
     unit_m: float | None = Field(default=None, gt=0.0)
-    """Length of one unit of the file [m], 0.001 for millimetres. None: what the file or its format says."""
+    """Length of one unit of the file [m], 0.001 for millimetres. null: what the file or its format says."""
     up_axis: Axis | None = None
-    """Axis of the file that points up: x, y or z. None: what the file says, else y or z where it shows a
-    building that stands so, else what its format has by default."""
+    """Axis of the file that points up: x, y or z. null: what the file says, else y or z where the scene looks
+    like a building that stands upright along it, else the default of its format."""
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Added to every point, after units and axes [m]. A scene that then lies more than 100 m from the origin
+    """Offset of every point, after units and axes [m]. A scene that then lies more than 100 m from the origin
     along an axis is moved there, by whole metres, and a note says by how much."""
     inside_m: tuple[float, float, float] | None = None
-    """A point in free space of the loaded scene, where rooms are entered [m]. None: unknown."""
+    """A point in the space to fly in, such as a room of the loaded scene [m]. null: unknown."""
     light_scale: float | None = Field(default=None, gt=0.0)
-    """Factor from candela in the file to radiance reflected at 1 m, refused where the file has no lights.
-    None: such that rooms are well lit."""
+    """Radiance reflected at 1 m per candela of the lights in the file; refused where the file has no lights.
+    null: a factor that lights the rooms well."""
     missing_texture: Literal["error", "ignore"] = "error"
-    """The response to a missing texture file: stop, or go on with the base colour alone."""
+    """Response to a missing texture file. error: stop; ignore: use the base colour alone."""
     ambient_up: LinearRgb = (0.35, 0.35, 0.36)
-    """Linear radiance that a white surface facing up reflects of the ambient light."""
+    """Linear RGB radiance of a white surface that faces up, from ambient light alone."""
     ambient_down: LinearRgb = (0.22, 0.21, 0.20)
-    """Linear radiance that a white surface facing down reflects of the ambient light."""
+    """Linear RGB radiance of a white surface that faces down, from ambient light alone."""
 
     def load(self, *, pictures: bool = True) -> Scene:
         """Read the mesh file; see `load_mesh_scene`."""

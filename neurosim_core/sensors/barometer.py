@@ -36,17 +36,17 @@ class BarometerConfig(StateSensorConfig):
 
     kind: Literal["barometer"] = "barometer"
     rate_hz: RateHz = 50.0
-    """Readings a second [Hz]."""
+    """Reading rate [Hz]."""
     mount: Mount = Mount()
     """Pose on the body."""
     altitude_m: Annotated[float, Field(ge=-5000.0, le=19_000.0)] = 0.0
-    """Height of z = 0 above sea level [m]."""
+    """Altitude of z = 0 above sea level [m]."""
     sea_level_pa: Annotated[float, Field(gt=0.0)] = 101_325.0
     """Pressure at sea level [Pa]."""
     sea_level_k: Annotated[float, Field(gt=200.0, le=340.0)] = 288.15
     """Temperature at sea level [K]."""
     errors: ErrorConfig = ErrorConfig()
-    """In Pa, such as {white: 1.3, markov: 30, markov_time_s: 600, resolution: 0.18}; weather is a walk."""
+    """Errors [Pa]: {white: 1.3, markov: 30, markov_time_s: 600, resolution: 0.18}; a walk models weather."""
 
     packet_type = Pressure
 

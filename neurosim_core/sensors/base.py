@@ -51,6 +51,10 @@ class SensorConfig(BaseConfig):
 
     packet_type: ClassVar[type[Packet]]
     """Class of its packets."""
+    is_overlay: ClassVar[bool] = False
+    """A viewer draws its pictures over those of a colour camera with the same view."""
+    reported: ClassVar[Mapping[str, Callable[[Any], str]]] = {}
+    """What the report of a flight says of its settings, by the title of the row."""
 
     if TYPE_CHECKING:
         kind: str

@@ -29,15 +29,15 @@ class Contact(Packet):
 
 @register("sensor", "contact")
 class ContactConfig(StateSensorConfig):
-    """A switch that closes where a small sphere at its mount touches something."""
+    """A switch that closes when a small sphere at its mount touches something."""
 
     kind: Literal["contact"] = "contact"
     rate_hz: RateHz = 100.0
-    """Readings a second [Hz]."""
+    """Reading rate [Hz]."""
     mount: Mount = Mount(position_m=(0.0, 0.0, -0.1))
-    """Where its tip is on the body."""
+    """Position of the tip on the body."""
     radius_m: Annotated[float, Field(ge=0.0)] = 0.03
-    """Radius of the tip [m]: with `on_collision: end`, the vehicle itself must not touch before."""
+    """Radius of the tip [m]; with `on_collision: end`, the vehicle itself must not touch first."""
 
     packet_type = Contact
 

@@ -51,11 +51,11 @@ class Corners(Packet):
 
 @register("sensor", "corners")
 class CornersConfig(EdgeLimits, CameraConfig, PictureSensorConfig):
-    """A camera that finds corners of the geometry: a list with sub-pixel positions and lasting numbers."""
+    """A camera that finds corners of the geometry: sub-pixel positions with persistent numbers."""
 
     kind: Literal["corners"] = "corners"
     turn_rad: Annotated[float, Field(gt=0.0, lt=1.5)] = 0.5
-    """Angle between two edges, or between one and the continuation of the other, that is a corner [rad]."""
+    """Smallest angle between two edges, or the continuation of one, that makes a corner [rad]."""
 
     packet_type = Corners
     output: ClassVar[str] = "instance"

@@ -28,9 +28,9 @@ class EdgeLimits(BaseConfig):
     """What is an edge, and what is rendered to find it."""
 
     jump_ratio: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.02
-    """Distance between two surfaces that is an edge, as a part of the range."""
+    """Smallest distance between two surfaces that makes an edge, relative to the range."""
     crease_rad: Annotated[float, Field(gt=0.0, lt=3.2)] = 0.5
-    """Angle between two normals that is an edge [rad]."""
+    """Smallest angle between two normals that makes an edge [rad]."""
 
     @property
     def outputs(self) -> frozenset[str]:

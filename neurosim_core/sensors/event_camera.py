@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -21,7 +21,7 @@ from neurosim_core.sensors.base import (
     RateHz,
     RenderRequest,
 )
-from neurosim_core.sensors.event_config import EventCameraConfig
+from neurosim_core.sensors.event_config import EventCameraConfig, describe_pixel
 from neurosim_core.sensors.event_labels import EventLabel, EventLabels
 from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS
 from neurosim_core.sensors.event_worlds import WorldEventCamera
@@ -57,6 +57,7 @@ class EventSensorConfig(FrameSensorConfig):
     """With the label `semantic`: patterns of names by class, as of a `semantic` camera."""
 
     packet_type = Events
+    reported: ClassVar[Any] = {"pixels": lambda sensor: describe_pixel(sensor.pixel)}
 
     @model_validator(mode="after")
     def _classes_are_labels(self) -> EventSensorConfig:

@@ -23,19 +23,19 @@ Decades = Annotated[float, Field(ge=0.0, le=2.0)]
 
 
 class _ThresholdNoiseConfig(NoiseTermConfig):
-    """Thresholds that differ from the nominal ones by normal numbers."""
+    """Thresholds with normally distributed deviations from the nominal ones."""
 
     sigma_on: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
-    """Standard deviation of the threshold upwards, in log radiance."""
+    """Standard deviation of the ON threshold, in log radiance."""
     sigma_off: Annotated[float, Field(ge=0.0, le=10.0)] = 0.03
-    """Standard deviation of the threshold downwards, in log radiance."""
+    """Standard deviation of the OFF threshold, in log radiance."""
     minimum: Annotated[float, Field(ge=1e-3, le=100.0)] = 0.01
-    """Smaller thresholds are raised to this one."""
+    """Smaller thresholds are raised to this one, in log radiance."""
 
 
 @register("noise", "threshold_spread")
 class ThresholdSpreadConfig(_ThresholdNoiseConfig):
-    """Mismatch: the thresholds of a pixel differ from the nominal ones by normal numbers that stay."""
+    """Mismatch: the thresholds of each pixel have a fixed, normally distributed deviation."""
 
     compiled = ("spread",)
 
@@ -49,7 +49,7 @@ class ThresholdJitterConfig(_ThresholdNoiseConfig):
 
 @register("noise", "lin_log")
 class LinLogConfig(NoiseTermConfig):
-    """A logarithm that becomes a line in the dark, as in v2e, where 8-bit pictures have no more steps.
+    """A logarithm that becomes linear in the dark, where 8-bit pictures are too coarse, as in v2e.
 
     With DN the radiance in units of white_radiance / 255, the pixel sees ln(DN) above `linear_below`, here D,
     and DN ln(D) / D below.
@@ -58,7 +58,7 @@ class LinLogConfig(NoiseTermConfig):
     compiled = ("lin_log",)
 
     linear_below: Annotated[float, Field(gt=1.0, le=255.0)] = 20.0
-    """Light at which the logarithm begins [white / 255]."""
+    """Radiance below which the response is linear [white_radiance / 255]."""
 
     def numbers(self, white_radiance: float) -> tuple[float, ...]:
         """Return radiance where the logarithm begins, its logarithm, and log radiance over that light."""
@@ -68,7 +68,7 @@ class LinLogConfig(NoiseTermConfig):
 
 @register("noise", "low_pass")
 class LowPassConfig(NoiseTermConfig):
-    """The photoreceptor: first order, the slower the darker.
+    """Bandwidth of the photoreceptor: a first-order low-pass filter, slower in the dark.
 
     With I the radiance at the pixel, I_w that of white and I_d what the dark current stands for, the 3 dB
     frequency is cutoff_hz min((I + I_d) / (I_w + I_d), 1).
@@ -77,9 +77,9 @@ class LowPassConfig(NoiseTermConfig):
     compiled = ("low_pass",)
 
     cutoff_hz: Annotated[float, Field(gt=0.0, le=1e12)] = 3000.0
-    """3 dB frequency at `white_radiance` [Hz]; above it the bias limits it, and it grows no more."""
+    """3 dB frequency at `white_radiance` [Hz]; above that light it stays, limited by the bias current."""
     dark_radiance: Annotated[float, Field(ge=0.0)] = 0.08
-    """Radiance that the dark current is worth: it keeps the time constant of a black pixel finite."""
+    """Radiance equivalent of the dark current; it keeps the time constant of a black pixel finite."""
 
 
 @register("noise", "leak")
@@ -89,11 +89,11 @@ class LeakConfig(NoiseTermConfig):
     compiled = ("leak",)
 
     rate_hz: Annotated[float, Field(ge=0.0, le=1e4)] = 0.1
-    """Events a second and pixel in a still scene, in the dark [Hz]."""
+    """ON events per second of a pixel in a still scene, in the dark [Hz]."""
     spread_decades: Decades = 0.1
-    """Standard deviation of the common logarithm of the rate from pixel to pixel; it stays."""
+    """Standard deviation of log10 of the rate between pixels; the rate of a pixel is fixed."""
     bright_factor: Annotated[float, Field(ge=0.0, le=1e4)] = 1.0
-    """Factor on the rate at `white_radiance`; light leaks through the switch, so that it grows linearly."""
+    """Factor on the rate at `white_radiance`, linear in light, which leaks through the switch."""
 
     def terms(self) -> tuple[str, ...]:
         """Return the names of what is compiled in."""
@@ -102,38 +102,38 @@ class LeakConfig(NoiseTermConfig):
 
 @register("noise", "shot_noise")
 class ShotNoiseConfig(NoiseTermConfig):
-    """Events without cause, a Poisson process in each pixel; fewer where it is bright."""
+    """Shot noise: random events, a Poisson process in each pixel; fewer where it is bright."""
 
     compiled = ("spontaneous",)
 
     rate_hz: Rate = 1.0
-    """Events a second and pixel in the dark, of both polarities together [Hz]."""
+    """Events per second of a pixel in the dark, of both polarities together [Hz]."""
     bright_factor: Share = 0.25
     """Factor on the rate at `white_radiance` and above; it falls linearly with radiance."""
     on_fraction: Share = 0.5
-    """Share of ON events."""
+    """Share of ON events, from 0 to 1."""
     spread_decades: Decades = 0.1
-    """Standard deviation of the common logarithm of the rate from pixel to pixel; it stays."""
+    """Standard deviation of log10 of the rate between pixels; the rate of a pixel is fixed."""
     by_threshold: bool = False
     """Whether the rate of a polarity is inversely proportional to the threshold of the pixel, as in v2e."""
 
 
 class NoiseLevelConfig(BaseConfig):
-    """Events without cause in one light, as they were measured."""
+    """Measured rates of random events at one illuminance."""
 
     lux: Annotated[float, Field(ge=1e-6, le=1e7)]
     """Illuminance of the scene [lux]."""
     on_hz: Rate
-    """ON events a second of the median pixel [Hz]."""
+    """ON events per second of the median pixel [Hz]."""
     off_hz: Rate
-    """OFF events a second of the median pixel [Hz]."""
+    """OFF events per second of the median pixel [Hz]."""
     spread_decades: Decades = 0.25
-    """Standard deviation of the common logarithm of the rates; a pixel has one rank in all lights."""
+    """Standard deviation of log10 of the rates between pixels; a pixel has one rank at all illuminances."""
 
 
 @register("noise", "measured_noise")
 class MeasuredNoiseConfig(NoiseTermConfig):
-    """Events without cause at rates that were measured in several lights, for each polarity.
+    """Random events at rates measured at several illuminances, for each polarity.
 
     Each pixel is a Poisson process. Between two lights rates are linear in the logarithm of light, beyond
     them they stay. They come from `levels`, or each pixel takes those of a random pixel in `file`.
@@ -142,12 +142,12 @@ class MeasuredNoiseConfig(NoiseTermConfig):
     compiled = ("spontaneous", "measured")
 
     white_lux: Annotated[float, Field(ge=1e-3, le=1e7)] = 1000.0
-    """Illuminance that `white_radiance` stands for [lux]."""
+    """Illuminance that corresponds to `white_radiance` [lux]."""
     levels: tuple[NoiseLevelConfig, ...] = ()
-    """Rates by light, from dark to bright: [{lux: 0.1, on_hz: 5, off_hz: 4}, ...]."""
+    """Rates by ascending illuminance: [{lux: 0.1, on_hz: 5, off_hz: 4}, ...]."""
     file: Path | None = None
-    """Rates of the pixels of a sensor: .npz with lux [L], on_hz [L, P] and off_hz [L, P], dark to bright.
-    `neurosim fit-sensor --also` makes one."""
+    """Rates of P pixels of a sensor at L ascending illuminances: .npz with lux [L], on_hz [L, P], off_hz [L,
+    P]. `neurosim fit-sensor --also` makes one."""
 
     @model_validator(mode="after")
     def _rates_are_there(self) -> MeasuredNoiseConfig:
@@ -161,16 +161,16 @@ class MeasuredNoiseConfig(NoiseTermConfig):
 
 @register("noise", "hot_pixels")
 class HotPixelConfig(NoiseTermConfig):
-    """A few pixels that fire all the time, at random."""
+    """A few pixels that fire continuously, at random times."""
 
     compiled = ("spontaneous",)
 
     fraction: Share = 1e-4
-    """Share of hot pixels; which ones is drawn once."""
+    """Share of hot pixels, which are drawn once."""
     rate_hz: Rate = 100.0
-    """Events a second of a hot pixel [Hz]."""
+    """Events per second of a hot pixel [Hz]."""
     on_fraction: Share = 1.0
-    """Share of ON events."""
+    """Share of ON events, from 0 to 1."""
 
 
 @register("noise", "stochastic")
@@ -194,17 +194,17 @@ class StochasticConfig(NoiseTermConfig):
     k1: Annotated[float, Field(ge=0.0, le=1e4)]
     """Events per e-fold of light; its inverse is the threshold."""
     k2: Annotated[float, Field(ge=0.0, le=1e6)]
-    """Light that the dark current is worth [white / 255]."""
+    """Radiance equivalent of the dark current [white_radiance / 255]."""
     k3: Annotated[float, Field(ge=0.0, le=1e3)]
-    """Photon noise."""
+    """Photon noise, times sqrt(L) / (L + k2) [1/sqrt(us)]."""
     k4: Annotated[float, Field(ge=0.0, le=1.0)]
-    """Leak in the dark [1/us]."""
+    """Leak rate in the dark [1/us]."""
     k5: Annotated[float, Field(ge=0.0, le=1e-3)]
-    """Leak by parasitic photocurrent, for each unit of light [1/us]."""
+    """Leak rate by parasitic photocurrent, per unit of L [1/us]."""
     k6: Annotated[float, Field(ge=0.0, le=1.0)]
     """Noise that does not depend on light [1/sqrt(us)]."""
     random_phase: bool = True
-    """Begin at voltages drawn from 0 ... 1, as a camera that has been running; false: at 0, as published."""
+    """Whether voltages begin at random in [0, 1), as in a running camera; false: at 0, as published."""
 
     @model_validator(mode="after")
     def _noise_is_bounded(self) -> StochasticConfig:
@@ -218,28 +218,28 @@ class StochasticConfig(NoiseTermConfig):
 
 
 class ReadoutConfig(BaseConfig):
-    """The arbiter between the pixels and the bus: events wait for it, and are stamped when they are read.
+    """The arbiter between pixels and bus: events queue for it, and their stamps are readout times.
 
     `event`: one event at a time, in the order in which they came. `row`: the row with the oldest event that
     waits is read at once, all its events get the same stamp; it takes row_s + n / bandwidth_hz.
     """
 
     kind: Literal["event", "row"] = "event"
-    """Who is read together: one event, or all that wait in a row."""
+    """What is read at a time: one event, or all waiting events of a row."""
     bandwidth_hz: Annotated[float, Field(ge=1.0, le=1e12)] = 12e6
-    """Events a second that can be read [Hz]."""
+    """Readout bandwidth, in events per second [Hz]."""
     row_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """`row`: time to reach a row, before its events are read [s]."""
+    """`row`: time to select a row before its events are read [s]."""
     handshake: bool = False
-    """Whether a pixel waits in reset until its event is read: what it would have fired meanwhile is lost, and
-    counted in `Events.dropped_count`."""
+    """Whether a pixel stays in reset until its event is read: events that it would have fired meanwhile are
+    lost, and counted in `Events.dropped_count`."""
     latency_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """Time from the readout of an event to its stamp, on average [s]."""
+    """Mean time from the readout of an event to its stamp [s]."""
     jitter_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """Standard deviation of that time, event by event; no stamp is before the readout [s]."""
     queue_length: Annotated[int, Field(ge=1, le=1 << 26)] = 65_536
-    """Most events that wait; those that come while so many do are lost, and counted in
-    `Events.dropped_count`. To read them must take 60 s at most."""
+    """Capacity of the queue [events]; events that find it full are lost, and counted in
+    `Events.dropped_count`. Reading a full queue must take 60 s at most."""
 
     @model_validator(mode="after")
     def _queue_is_read_in_time(self) -> ReadoutConfig:
@@ -272,53 +272,53 @@ def describe_pixel(pixel: EventCameraConfig) -> str:
 
 
 class EventCameraConfig(BaseConfig):
-    """An event camera, by default ideal: the same two thresholds in every pixel, no noise, no dead time.
+    """The pixels of an event camera, ideal by default: equal thresholds, no noise, no dead time.
 
     What counts as reaching a threshold, when samples are rounded to float32, is in `EventCamera`.
     """
 
     preset: str | None = None
-    """A sensor whose settings these are, unless given here: dvs128, davis240c, davis346, gen3, gen4, imx636,
-    v2e_clean, v2e_noisy, voltmeter_dvs240 or voltmeter_dvs346 (sources: event_presets.yaml). Single keys win,
-    and null turns a group off: {preset: davis346, leak: {rate_hz: 0.2}, shot_noise: null}. In a file that
-    lists every key, take out those that the preset is to give."""
+    """Name of a sensor whose settings apply where none are given here: dvs128, davis240c, davis346, gen3,
+    gen4, imx636, v2e_clean, v2e_noisy, voltmeter_dvs240 or voltmeter_dvs346 (sources: event_presets.yaml).
+    null turns a group off: {preset: davis346, leak: {rate_hz: 0.2}, shot_noise: null}. From a file that lists
+    every key, remove those that the preset shall set."""
     threshold_on: float = Field(default=0.2, ge=1e-3, le=100.0)
-    """Rise of log radiance (natural logarithm) that fires an event of polarity 1."""
+    """Rise of log radiance (natural logarithm) that fires an ON event, polarity 1."""
     threshold_off: float = Field(default=0.2, ge=1e-3, le=100.0)
-    """Fall of log radiance (natural logarithm) that fires an event of polarity 0."""
+    """Fall of log radiance (natural logarithm) that fires an OFF event, polarity 0."""
     white_radiance: float = Field(default=1.0, gt=0.0, le=1e30)
-    """Radiance that all that depends on light takes for white, the brightest of a picture."""
+    """Radiance of white, the brightest value of a picture, for all terms that depend on light."""
     threshold_spread: ThresholdSpreadConfig | None = None
-    """Thresholds that differ from pixel to pixel, and stay: {sigma_on: 0.03, sigma_off: 0.03, minimum: 0.01},
-    standard deviations in log radiance; null: none."""
+    """Fixed thresholds that differ between pixels: {sigma_on: 0.03, sigma_off: 0.03, minimum: 0.01}, standard
+    deviations in log radiance; null: none."""
     threshold_jitter: ThresholdJitterConfig | None = None
     """Thresholds drawn anew after each event: {sigma_on: 0.03, sigma_off: 0.03, minimum: 0.01}; null: they
-    stay."""
+    are fixed."""
     lin_log: LinLogConfig | None = None
-    """Linear, not logarithmic, in the dark, as v2e: {linear_below: 20}; null: logarithmic everywhere."""
+    """Linear response in the dark, as in v2e: {linear_below: 20}; null: logarithmic everywhere."""
     low_pass: LowPassConfig | None = None
-    """Finite bandwidth of the photoreceptor, falling with light: {cutoff_hz: 3000, dark_radiance: 0.08};
-    null: infinitely fast."""
+    """Finite bandwidth of the photoreceptor, lower in the dark: {cutoff_hz: 3000, dark_radiance: 0.08}; null:
+    unlimited."""
     refractory_s: float = Field(default=0.0, ge=0.0, le=10.0)
-    """Time after each event in which a pixel is held in reset; its reference is the signal at its end [s]."""
+    """Time after each event in which a pixel is held in reset [s]; its reference is the signal at its end."""
     leak: LeakConfig | None = None
-    """ON events of still pixels, at a steady rate: {rate_hz: 0.1, spread_decades: 0.1}; null: none."""
+    """ON events at a steady rate, also of still pixels: {rate_hz: 0.1, spread_decades: 0.1}; null: none."""
     shot_noise: ShotNoiseConfig | None = None
     """Random events, more of them in the dark: {rate_hz: 1, bright_factor: 0.25, on_fraction: 0.5,
     spread_decades: 0.1}; null: none."""
     measured_noise: MeasuredNoiseConfig | None = None
-    """Random events at rates measured in several lights, in place of `shot_noise`: {white_lux: 1000, levels:
-    [{lux: .., on_hz: .., off_hz: .., spread_decades: 0.25}, ..]}, or {file: my_camera.npz}; null: none."""
+    """Random events at measured rates, instead of `shot_noise`: {white_lux: 1000, levels: [{lux: .., on_hz:
+    .., off_hz: .., spread_decades: 0.25}, ..]}, or {file: my_camera.npz}; null: none."""
     hot_pixels: HotPixelConfig | None = None
-    """Pixels that fire all the time: {fraction: 1e-4, rate_hz: 100, on_fraction: 1}; null: none."""
+    """Pixels that fire continuously: {fraction: 1e-4, rate_hz: 100, on_fraction: 1}; null: none."""
     stochastic: StochasticConfig | None = None
-    """Brownian motion in place of thresholds, DVS-Voltmeter: {k1: .., .. k6: .., random_phase: true}; instead
-    of low_pass, leak and noise. null: thresholds."""
+    """DVS-Voltmeter model, Brownian motion instead of thresholds: {k1: .., .. k6: .., random_phase: true};
+    replaces low_pass, leak and noise. null: thresholds."""
     noise: Annotated[tuple[SerializeAsAny[NoiseTermConfig], ...], BeforeValidator(parse_terms)] = ()
-    """Terms of other packages, by kind: [{kind: flicker, depth: 0.1}]; each kind once."""
+    """Noise terms of other packages, by kind: [{kind: flicker, depth: 0.1}]; each kind once."""
     readout: ReadoutConfig | None = None
     """Arbiter with limited bandwidth: {kind: event or row, bandwidth_hz: 12e6, row_s: 0, queue_length:
-    65536}; null: all events at once."""
+    65536}; null: all events are read at once."""
     event_count_max: int = Field(default=1 << 24, ge=1, le=1 << 30)
     """Most events between two frames. When there are more, the rows from the top are kept as long as they
     fit; the events of the others are lost, and counted in `Events.dropped_count`. The buffer grows up to this

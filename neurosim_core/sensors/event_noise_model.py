@@ -113,7 +113,7 @@ _SIGNAL = (SignalTerm, wp.uint64, wp.int32, wp.int64, wp.float64)
 
 
 class NoiseTermConfig(BaseConfig):
-    """A way in which pixels depart from the ideal; a package registers its own as `noise`, by kind.
+    """A deviation of pixels from the ideal; a package registers its own as `noise`, by kind.
 
     A term of another package changes what a pixel sees: it extends this class by its `kind`, its keys,
     `numbers` and `signal`, and is asked for under `noise` of the pixel. It acts on log radiance after

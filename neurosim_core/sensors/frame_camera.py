@@ -40,14 +40,14 @@ _DARKEST = wp.constant(1.0e-6)
 
 
 class AutoExposureConfig(BaseConfig):
-    """Exposure that follows the light."""
+    """Automatic exposure."""
 
     target: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.18
-    """Mean luma, geometric, that it aims at; 1 is white."""
+    """Target of the geometric mean of luma; 1 is white."""
     lag_s: NonNegative = 0.2
-    """Time constant with which it follows [s]."""
+    """Time constant of the adaptation [s]."""
     gain_min: Annotated[float, Field(gt=0.0)] = 0.05
-    """Least gain."""
+    """Smallest gain."""
     gain_max: Annotated[float, Field(gt=0.0)] = 50.0
     """Largest gain."""
 
@@ -61,21 +61,21 @@ class FrameCameraConfig(ImageSensorConfig):
 
     kind: Literal["frame_camera"] = "frame_camera"
     gain: Annotated[float, Field(gt=0.0)] = 1.0
-    """Factor of all light, fixed; with `auto_exposure` it does not count."""
+    """Fixed factor of all light; ignored with `auto_exposure`."""
     auto_exposure: AutoExposureConfig | None = None
-    """Exposure that follows the light: {target: 0.18, lag_s: 0.2}; null: the gain is fixed."""
+    """Automatic exposure: {target: 0.18, lag_s: 0.2}; null: the gain is fixed."""
     full_well_e: Annotated[float, Field(ge=100.0)] = 10000.0
-    """Electrons of white, of which shot noise is the root."""
+    """Electrons of a white pixel; shot noise is the square root of the electrons."""
     shot_noise: bool = False
-    """Let the electrons of a pixel vary as they do."""
+    """Whether pixels have shot noise."""
     read_noise_e: NonNegative = 0.0
-    """Standard deviation of reading a pixel, in electrons."""
+    """Standard deviation of the read noise [electrons]."""
     color: Literal["rgb", "mono", "bayer_rggb", "bayer_bggr", "bayer_gbrg", "bayer_grbg"] = "rgb"
-    """All colours at each pixel, luma, or one colour at each pixel, as a filter lets through."""
+    """rgb: all colours at each pixel; mono: luma; bayer_*: one colour at each pixel, by a filter mosaic."""
     bits: Literal[8, 10, 12, 16] = 8
-    """Bits of a number; those of 10 and 12 bits are in the upper ones of 16."""
+    """Bits of a pixel value; values of 10 and 12 bits are in the upper bits of 16."""
     curve: Literal["srgb", "linear"] | Annotated[float, Field(gt=0.2, lt=5.0)] = "srgb"
-    """Curve between light and numbers; a number is the exponent of 1 / gamma."""
+    """Transfer curve from light to pixel values: srgb, linear, or a gamma (exponent 1 / gamma)."""
 
     output = "radiance"
     encoding: ClassVar[Any] = "rgb8"

@@ -52,23 +52,23 @@ class GpsFix(Packet):
 
 @register("sensor", "gps")
 class GpsConfig(LateConfig):
-    """A GPS receiver, without errors and at once by default."""
+    """A GPS receiver, without errors and without delay by default."""
 
     kind: Literal["gps"] = "gps"
     rate_hz: RateHz = 10.0
-    """Fixes a second [Hz]."""
+    """Rate of position fixes [Hz]."""
     mount: Mount = Mount()
-    """Where the antenna is on the body."""
+    """Position of the antenna on the body."""
     latitude_rad: Annotated[float, Field(gt=-1.57, lt=1.57)] = math.radians(47.4)
-    """Geodetic latitude of the origin of W [rad]."""
+    """Geodetic latitude of the world origin [rad]."""
     longitude_rad: Annotated[float, Field(ge=-math.pi, le=math.pi)] = math.radians(8.55)
-    """Longitude of the origin of W [rad]."""
+    """Longitude of the world origin [rad]."""
     altitude_m: float = 450.0
-    """Altitude of the origin of W above the ellipsoid [m]."""
+    """Altitude of the world origin above the ellipsoid [m]."""
     position_errors: ErrorConfig = ErrorConfig()
-    """In m, east, north, up, such as {white: 0.1, markov: [1.5, 1.5, 3], markov_time_s: 100}."""
+    """Errors east, north, up [m], such as {white: 0.1, markov: [1.5, 1.5, 3], markov_time_s: 100}."""
     velocity_errors: ErrorConfig = ErrorConfig()
-    """In m/s, likewise."""
+    """Errors east, north, up [m/s]."""
 
     packet_type = GpsFix
 

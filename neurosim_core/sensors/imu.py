@@ -47,16 +47,16 @@ vec_processes = wp.types.vector(length=_PROCESSES, dtype=wp.float64)
 
 @register("sensor", "imu")
 class ImuConfig(StateSensorConfig):
-    """An inertial measurement unit: its place, its rate, and its errors, of which it has none by default."""
+    """An inertial measurement unit; without errors by default."""
 
     kind: Literal["imu"] = "imu"
     preset: str | None = None
-    """A sensor whose errors these are, unless given here: bmi088, icm20948, adis16448 (sources in
+    """Name of a sensor whose errors apply where none are given here: bmi088, icm20948, adis16448 (sources in
     imu_presets.yaml)."""
     mount: Mount = Mount()
     """Pose on the body."""
     rate_hz: Annotated[float, Field(gt=0.0, le=1e6)] = 400.0
-    """Samples a second [Hz]."""
+    """Sample rate [Hz]."""
     accelerometer_noise_density: NonNegative = 0.0
     """White noise N of specific force [m/s^2/sqrt(Hz)]."""
     accelerometer_random_walk: NonNegative = 0.0
@@ -65,9 +65,9 @@ class ImuConfig(StateSensorConfig):
     """Bias instability B of specific force [m/s^2]: the Allan deviation has a floor of 0.664 B from 0.3 to
     300 s."""
     accelerometer_range_m_s2: Annotated[float, Field(gt=0.0)] | None = None
-    """Largest specific force that can be told along an axis, of either sign [m/s^2]; none: no limit."""
+    """Largest measurable specific force along an axis, of either sign [m/s^2]; null: no limit."""
     accelerometer_resolution_m_s2: NonNegative = 0.0
-    """Step between values of specific force [m/s^2]; 0: continuous."""
+    """Quantisation step of specific force [m/s^2]; 0: continuous."""
     gyroscope_noise_density: NonNegative = 0.0
     """White noise N of angular rate [rad/s/sqrt(Hz)]."""
     gyroscope_random_walk: NonNegative = 0.0
@@ -76,9 +76,9 @@ class ImuConfig(StateSensorConfig):
     """Bias instability B of angular rate [rad/s]: the Allan deviation has a floor of 0.664 B from 0.3 to 300
     s."""
     gyroscope_range_rad_s: Annotated[float, Field(gt=0.0)] | None = None
-    """Largest angular rate that can be told about an axis, of either sign [rad/s]; none: no limit."""
+    """Largest measurable angular rate about an axis, of either sign [rad/s]; null: no limit."""
     gyroscope_resolution_rad_s: NonNegative = 0.0
-    """Step between values of angular rate [rad/s]; 0: continuous."""
+    """Quantisation step of angular rate [rad/s]; 0: continuous."""
 
     @model_validator(mode="before")
     @classmethod

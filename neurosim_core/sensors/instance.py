@@ -41,6 +41,7 @@ class InstanceSensorConfig(ImageSensorConfig):
     kind: Literal["instance"] = "instance"
 
     packet_type = LabelImage
+    is_overlay = True
     output = "instance"
     encoding = "32SC1"
 

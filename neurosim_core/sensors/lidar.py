@@ -54,49 +54,49 @@ def lidar_presets() -> dict[str, dict[str, Any]]:
 
 
 class DetectionConfig(BaseConfig):
-    """Which rays come back."""
+    """Signal-dependent detection: which rays return."""
 
     range_m: Annotated[float, Field(gt=0.0)]
-    """Range at which half of the rays come back [m], from a surface that faces the sensor."""
+    """Range at which half of the rays return [m], from a surface that faces the sensor."""
     reflectivity: Annotated[float, Field(gt=0.0, le=1.0)] = 0.1
     """Albedo of that surface."""
     speckle: Annotated[float, Field(gt=0.0, le=3.0)] = 0.3
-    """Standard deviation s of the logarithm of the signal."""
+    """Standard deviation of the natural logarithm of the signal."""
 
 
 @register("sensor", "lidar")
 class LidarConfig(PictureSensorConfig):
-    """A LiDAR; x of its mount looks forward, z up. One return for each ray; without errors by default."""
+    """A LiDAR with one return per ray, without errors by default; x of its mount looks forward, z up."""
 
     kind: Literal["lidar"] = "lidar"
     preset: str | None = None
-    """A sensor whose settings these are, unless given here: velodyne_vlp16, ouster_os1_128, hesai_xt32,
-    livox_mid40 (sources in lidar_presets.yaml). Single keys win."""
+    """Name of a sensor whose settings apply where none are given here: velodyne_vlp16, ouster_os1_128,
+    hesai_xt32, livox_mid40 (sources in lidar_presets.yaml)."""
     scan: AnyScan = SpinningScan(elevations_rad=tuple(round(-0.26 + 0.52 * k / 15.0, 6) for k in range(16)))
-    """Which way rays go, and when: {kind: spinning, elevations_rad: [...], columns: 1024}, {kind: pattern,
-    file: rays.npy}, {kind: rosette, ...}."""
+    """Directions and times of the rays: {kind: spinning, elevations_rad: [...], columns: 1024}, {kind:
+    pattern, file: rays.npy}, {kind: rosette, ...}."""
     rate_hz: Annotated[float, Field(gt=0.0, le=1e4)] = 10.0
-    """Sweeps a second [Hz]."""
+    """Sweep rate [Hz]."""
     sweep_s: NonNegative | None = None
-    """Time from the first ray of a sweep to the last, which is cast at the stamp [s]; null: as the scan says,
-    of a spinning one a period; 0: all rays at once."""
+    """Time from the first ray of a sweep to the last, which is cast at the stamp [s]; null: that of the scan,
+    one period for a spinning one; 0: all rays at once."""
     deskew: bool = False
-    """Give points where they are seen from the pose at the stamp; else each is seen from the sensor's pose
-    when its ray was cast, as real ones do."""
+    """Whether all points are relative to the sensor's pose at the stamp; false: each point is relative to the
+    pose at which its ray was cast, as in real sensors."""
     range_min_m: NonNegative = 0.1
-    """Nearer points are not seen [m]."""
+    """Smallest measured range [m]."""
     range_max_m: Annotated[float, Field(gt=0.0)] = 100.0
-    """Farther points are not seen [m]."""
+    """Largest measured range [m]."""
     range_noise_m: NonNegative = 0.0
-    """Standard deviation of the range [m]."""
+    """Standard deviation of the range, independent of the range [m]."""
     range_noise_ratio: NonNegative = 0.0
-    """A further part of it that grows with the range; the root of the sum of squares counts."""
+    """Standard deviation per metre of range; the two add as the root of the sum of squares."""
     range_resolution_m: NonNegative = 0.0
-    """Step between ranges [m]; 0: continuous."""
+    """Quantisation step of the range [m]; 0: continuous."""
     detection: DetectionConfig | None = None
-    """Rays with little signal are lost: {range_m: 100, reflectivity: 0.1, speckle: 0.3}; null: none is."""
+    """Loss of rays with little signal: {range_m: 100, reflectivity: 0.1, speckle: 0.3}; null: none."""
     dropout_probability: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
-    """Share of rays that are lost whatever they hit."""
+    """Probability that a ray is lost, whatever it hits."""
 
     packet_type = PointCloud
     output: ClassVar[str] = "returns"

@@ -27,7 +27,7 @@ class Scan(BaseConfig):
     """Settings that all scans have."""
 
     divergence_rad: DivergenceRad = 0.003
-    """Angle of the beam [rad]: textures are filtered over its footprint. The range is that of its axis."""
+    """Beam divergence [rad]: textures are filtered over its footprint. The range is that of the beam axis."""
 
     @property
     def width(self) -> int:
@@ -68,16 +68,16 @@ class Scan(BaseConfig):
 
 
 class SpinningScan(Scan):
-    """A column of lasers that turns to the right about z; all lasers of a column fire at once.
+    """A column of lasers that turns clockwise seen from above; all lasers of a column fire at once.
 
     Column 0 looks backwards, so that the cut between sweeps is behind the vehicle.
     """
 
     kind: Literal["spinning"] = "spinning"
     elevations_rad: Annotated[tuple[float, ...], Field(min_length=1, max_length=1024)]
-    """Elevation of each ring [rad]; ring 0 is the first."""
+    """Elevation of each ring, from ring 0 on [rad]."""
     columns: Annotated[int, Field(ge=1, le=16384)] = 1024
-    """Columns of a turn."""
+    """Number of columns per revolution."""
 
     def directions(self) -> NDArray[np.float64]:
         """Return azimuth and elevation of each ray [rad], shape [H, W, 2]."""
@@ -86,7 +86,7 @@ class SpinningScan(Scan):
 
 
 class RosetteScan(Scan):
-    """A beam through two prisms that turn at speeds of their own: petals around the x axis.
+    """A beam through two prisms that turn at different speeds: petals around the x axis.
 
     Each thin prism turns the beam by a constant small angle, in the direction in which it points. The real
     pattern goes on from sweep to sweep; here every sweep is the first.
@@ -98,11 +98,11 @@ class RosetteScan(Scan):
     half_angle_rad: Annotated[float, Field(gt=0.0, lt=1.5)]
     """Half the angle of the field of view [rad]; each prism turns the beam by half of it."""
     prism_rates_hz: tuple[float, float]
-    """Turns a second of the prisms [Hz]; opposite signs turn against each other."""
+    """Rotation rates of the two prisms [Hz]; opposite signs turn against each other."""
     sweep_s: Annotated[float, Field(gt=0.0)]
-    """Time that a sweep takes [s]."""
+    """Duration of a sweep [s]."""
     ray_count: Annotated[int, Field(ge=2, le=1_000_000)]
-    """Rays of a sweep."""
+    """Number of rays per sweep."""
 
     def directions(self) -> NDArray[np.float64]:
         """Return azimuth and elevation of each ray [rad], shape [H, W, 2]."""

@@ -31,20 +31,20 @@ class MagneticField(Packet):
 
 @register("sensor", "magnetometer")
 class MagnetometerConfig(StateSensorConfig):
-    """A magnetometer, without iron around it and without errors by default."""
+    """A magnetometer, without magnetic disturbances and errors by default."""
 
     kind: Literal["magnetometer"] = "magnetometer"
     rate_hz: RateHz = 100.0
-    """Readings a second [Hz]."""
+    """Reading rate [Hz]."""
     mount: Mount = Mount()
     """Pose on the body."""
     earth_field_t: Vector3 = (1.3e-6, 21.4e-6, -43.4e-6)
     """Field in W: east, north, up [T]. A calculator of the World Magnetic Model says it for a place and a
     date, with z down; the default is about that of central Europe."""
     hard_iron_t: Vector3 = (0.0, 0.0, 0.0)
-    """What magnets on the vehicle add, in S [T]."""
+    """Field of magnets on the vehicle, in S [T]."""
     soft_iron: tuple[Vector3, Vector3, Vector3] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    """Rows of the matrix by which iron on the vehicle bends the field, in S."""
+    """Matrix by which iron on the vehicle distorts the field, as rows, in S."""
     errors: ErrorConfig = ErrorConfig()
     """In T, such as {white: 3e-7, walk: 1e-9, resolution: 1.5e-7}. The resolution is that of the compass in
     the ICM-20948, 0.15 uT (TDK InvenSense, data sheet DS-000189 1.3, table 3, which gives no noise)."""

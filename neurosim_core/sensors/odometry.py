@@ -19,7 +19,7 @@ class OdometrySensorConfig(StateSensorConfig):
 
     kind: Literal["odometry"] = "odometry"
     rate_hz: RateHz = 200.0
-    """Samples a second [Hz]."""
+    """Sample rate [Hz]."""
 
     packet_type = Odometry
 

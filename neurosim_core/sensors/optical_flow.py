@@ -70,20 +70,21 @@ class OpticalFlow(Packet):
 
 @register("sensor", "optical_flow")
 class OpticalFlowConfig(CameraConfig, PictureSensorConfig):
-    """A camera that measures optical flow, exactly, of scene and moving bodies, through its lens."""
+    """A camera that measures the exact optical flow of scene and moving bodies, through its lens."""
 
     kind: Literal["optical_flow"] = "optical_flow"
     window_s: Annotated[float, Field(ge=0.0, le=10.0)] | None = None
-    """Time between the two pictures [s], the later of which is at the stamp; null: a period; 0: velocity at
-    the stamp, in px/s."""
+    """Time between the two pictures [s], of which the later one is at the stamp; null: one period; 0:
+    velocity at the stamp, in px/s."""
     direction: Literal["backward", "forward"] = "backward"
-    """backward: pixels are those of the later picture, and flow leads to where what they see was in the
-    earlier one; forward: pixels are those of the earlier picture. Velocities have no direction."""
+    """backward: flow of the pixels of the later picture, to where they see the same point in the earlier one;
+    forward: flow of the pixels of the earlier picture. Velocities have no direction."""
     occlusion: bool = True
-    """Find out what is hidden at the other time. Where the pixel's own picture does not tell, a second ray
-    does; what is thinner than a pixel may be overlooked."""
+    """Whether points that are hidden at the other time are marked. Where the pixel's own picture does not
+    tell, a second ray does; what is thinner than a pixel may be overlooked."""
 
     packet_type = OpticalFlow
+    is_overlay = True
     output: ClassVar[str] = "range"
 
     @property

@@ -45,7 +45,7 @@ class RangeFinderConfig(ImageSensorConfig):
     lens: PinholeConfig = PinholeConfig(width=5, height=5, horizontal_fov_rad=0.07)
     """Rays and field of view."""
     rate_hz: RateHz = 50.0
-    """Readings a second [Hz]."""
+    """Reading rate [Hz]."""
     range_min_m: Annotated[float, Field(ge=0.0)] = 0.02
     """Shortest distance that it measures [m]."""
     range_max_m: Annotated[float, Field(gt=0.0)] = 40.0

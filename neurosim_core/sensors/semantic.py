@@ -34,6 +34,7 @@ class SemanticSensorConfig(ImageSensorConfig):
     node in glTF). null: a class for each thing that files say, or names without the number at their end."""
 
     packet_type = LabelImage
+    is_overlay = True
     output = "instance"
     encoding = "32SC1"
 

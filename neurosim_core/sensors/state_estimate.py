@@ -32,21 +32,21 @@ _FIELDS = {"position": wp.vec3d, "orientation": wp.quatd, "velocity": wp.vec3d, 
 
 @register("sensor", "state_estimate")
 class StateEstimateConfig(LateConfig):
-    """The state as an estimator gives it, exact and at once by default."""
+    """The output of a state estimator, without errors and without delay by default."""
 
     kind: Literal["state_estimate"] = "state_estimate"
     rate_hz: RateHz = 200.0
-    """Estimates a second [Hz]."""
+    """Estimate rate [Hz]."""
     position_errors: ErrorConfig = ErrorConfig()
-    """In W [m], such as {white: 0.005, walk: 0.01}: a walk is drift."""
+    """Position errors in W [m], such as {white: 0.005, walk: 0.01}: a walk is drift."""
     attitude_errors: ErrorConfig = ErrorConfig()
-    """Rotation vector in B [rad], such as {white: 0.002}; no walk, which is `yaw_errors`."""
+    """Attitude errors, a rotation vector in B [rad], such as {white: 0.002}; no walk, see `yaw_errors`."""
     yaw_errors: ErrorConfig = ErrorConfig()
-    """Turn of the whole frame about z [rad], such as {walk: 0.001}; the first number counts."""
+    """Rotation of the whole frame about z [rad], such as {walk: 0.001}; only the first number counts."""
     velocity_errors: ErrorConfig = ErrorConfig()
-    """In W [m/s]."""
+    """Velocity errors in W [m/s]."""
     body_rate_errors: ErrorConfig = ErrorConfig()
-    """In B [rad/s]."""
+    """Body rate errors in B [rad/s]."""
 
     packet_type = Odometry
 

@@ -43,18 +43,18 @@ _DROPOUT = 1 << 20
 
 
 class ErrorConfig(BaseConfig):
-    """Errors of what is measured, in its unit: one number for all axes, or one for each; none by default."""
+    """Errors in the unit of the measurement: one number for all axes, or one per axis; none by default."""
 
     white: Axes = 0.0
-    """Standard deviation of a sample."""
+    """Standard deviation of white noise, per sample."""
     walk: Axes = 0.0
-    """Random walk of the bias, from 0, in the unit / sqrt(s)."""
+    """Random walk of a bias that begins at 0, in the unit / sqrt(s)."""
     markov: Axes = 0.0
-    """Standard deviation of a bias that comes and goes: a first-order Gauss-Markov process."""
+    """Standard deviation of a bias that follows a first-order Gauss-Markov process."""
     markov_time_s: Annotated[float, Field(gt=0.0)] = 100.0
-    """Its correlation time [s]."""
+    """Correlation time of that process [s]."""
     resolution: Axes = 0.0
-    """Step between values; 0: continuous."""
+    """Quantisation step; 0: continuous."""
 
     def terms(self) -> tuple[str, ...]:
         """Return which errors there are."""
@@ -109,11 +109,11 @@ class LateConfig(StateSensorConfig):
     """A state sensor whose samples come late, or not at all."""
 
     rate_hz: RateHz = 100.0
-    """Samples a second [Hz]."""
+    """Sample rate [Hz]."""
     delay_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
-    """Age of a sample when it comes, at the stamp [s]; a multiple of 1 / rate_hz."""
+    """Time from measurement to delivery, which is at the stamp [s]; a multiple of 1 / rate_hz."""
     dropout_probability: Probability = 0.0
-    """Share of samples that do not come."""
+    """Probability that a sample is not delivered."""
 
     @property
     def delay_count(self) -> int:

@@ -60,25 +60,25 @@ class CollisionFreeConfig(BaseConfig):
     """Settings that all planned paths have."""
 
     clearance_m: float = Field(default=0.3, gt=0.0)
-    """Distance from the path to the scene [m]: more than the vehicle's collision radius; holds everywhere."""
+    """Least distance between path and scene, everywhere [m]; must exceed the vehicle's collision radius."""
     limits: FlightLimits = FlightLimits()
-    """What the path may ask of the vehicle; time is scaled so that the tightest of them is met."""
+    """Limits of the path; its time is scaled so that the tightest of them is met."""
     lookahead_s: float = Field(default=0.5, gt=0.0, le=1e6)
-    """The vehicle looks to where it will be after this time [s]."""
+    """The heading points to where the vehicle is after this time [s]."""
 
 
 class TourConfig(CollisionFreeConfig):
-    """A flight through random places of the free space, as long as the run."""
+    """A flight through random places of the free space, for the whole run."""
 
     kind: Literal["tour"] = "tour"
     seed: int = Field(default=0, ge=0)
-    """Another seed, another tour."""
+    """Seed of the random goals."""
     leg_length_m: float = Field(default=7.0, gt=0.0)
-    """About how far the next goal is, along the way there [m]; less where the free space is smaller."""
+    """Approximate path length to the next goal [m]; less where the free space is smaller."""
     height_min_m: float = Field(default=0.9, ge=0.0)
-    """Least height of goals above what is below them [m]."""
+    """Smallest height of goals above the surface below them [m]."""
     height_max_m: float = Field(default=1.7, gt=0.0)
-    """Largest height of goals above what is below them [m]."""
+    """Largest height of goals above the surface below them [m]."""
 
     @model_validator(mode="after")
     def _heights_are_a_range(self) -> TourConfig:
@@ -90,11 +90,11 @@ class TourConfig(CollisionFreeConfig):
 
 
 class WaypointsConfig(CollisionFreeConfig):
-    """A flight through given places, from rest to rest; ways between them are found."""
+    """A flight through given places, from rest to rest; the paths between them are planned."""
 
     kind: Literal["waypoints"] = "waypoints"
     points_m: tuple[Vector3, ...] = Field(min_length=2)
-    """Places to pass [m], at least two; neighbours differ."""
+    """Positions to pass in W [m], at least two; consecutive ones differ."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -45,18 +45,18 @@ _FORMATS: dict[str, tuple[str, float, tuple[int, ...]]] = {
 
 
 class KeyframeConfig(BaseConfig):
-    """A pose at an instant."""
+    """A pose at one time."""
 
     time_s: float
     """Time [s]."""
     position_m: Vector3
-    """p_WB [m]."""
+    """Position of the body in W, p_WB [m]."""
     rpy_rad: Vector3 = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw of the body [rad]: R = Rz(yaw) Ry(pitch) Rx(roll)."""
 
 
 class PosesConfig(BaseConfig):
-    """A motion that is prescribed: the sensors follow it exactly, also through walls, without dynamics.
+    """A prescribed motion: the sensors follow it exactly, also through walls, without dynamics.
 
     Time begins at the first pose. Before the first and after the last pose the rig rests. It takes no
     commands, and touches nothing.
@@ -64,17 +64,17 @@ class PosesConfig(BaseConfig):
 
     kind: Literal["poses"] = "poses"
     file: FilePath | None = None
-    """File of poses."""
+    """File of poses; null: `keyframes` are given."""
     format: PoseFormat = "tum"
     """`tum`: time_s x y z qx qy qz qw. `euroc`: time_ns,x,y,z,qw,qx,qy,qz,... `csv`:
     time_s,x,y,z,qx,qy,qz,qw. `bag`: a bag of ROS 1 or ROS 2, with PoseStamped, TransformStamped or Odometry.
     Lines that begin with # are left out, and one line of names at the top of csv."""
     topic: str | None = None
-    """Of a bag: where its poses are; null: the only topic that has some."""
+    """`bag`: topic of the poses; null: the only topic that has some."""
     keyframes: Annotated[tuple[KeyframeConfig, ...], Field(min_length=2)] | None = None
     """Poses in place of a file: [{time_s: 0, position_m: [0, 0, 1]}, ...]."""
     frame: Literal["body", "optical"] = "body"
-    """Whose poses they are. `body`: x forward, y left, z up. `optical`: a camera's, x right, y down, z
+    """Frame whose poses these are. `body`: x forward, y left, z up. `optical`: a camera's, x right, y down, z
     forward; the origin of the body is there, and a camera whose mount is at zero sees from there."""
     start_s: Annotated[float, Field(ge=0.0)] = 0.0
     """Time after the first pose at which the run begins [s]."""

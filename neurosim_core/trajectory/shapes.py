@@ -40,29 +40,29 @@ class ShapeConfig(BaseConfig):
     """Settings that all closed-form paths have."""
 
     yaw: Literal["travel"] | float = 0.0
-    """Heading [rad], or travel: look where it flies."""
+    """Heading [rad], or travel: the direction of flight."""
     yaw_rate_max_rad_s: float = Field(default=3.0, gt=0.0)
-    """Largest yaw rate when looking where it flies [rad/s]."""
+    """Largest yaw rate with `yaw: travel` [rad/s]."""
 
 
 class HoverConfig(ShapeConfig):
-    """Staying at one place."""
+    """Hovering at one place."""
 
     kind: Literal["hover"] = "hover"
     position_m: Vector3 | None = None
-    """Where [m]; null: the middle of free space."""
+    """Position in W [m]; null: the middle of free space."""
 
 
 class LineConfig(ShapeConfig):
-    """A straight line from rest to rest, of least snap."""
+    """A straight minimum-snap line from rest to rest."""
 
     kind: Literal["line"] = "line"
     start_m: Vector3
-    """Where it begins [m]."""
+    """Start position in W [m]."""
     end_m: Vector3
-    """Where it ends [m]."""
+    """End position in W [m]."""
     speed_max_m_s: float = Field(default=2.0, gt=0.0, le=_LARGEST)
-    """Speed half-way [m/s]."""
+    """Largest speed, half-way [m/s]."""
 
     @model_validator(mode="after")
     def _ends_differ(self) -> LineConfig:
@@ -79,9 +79,9 @@ class PeriodicConfig(ShapeConfig):
     speed_max_m_s: float = Field(default=2.0, gt=0.0, le=_LARGEST)
     """Largest speed [m/s]."""
     laps: float = Field(default=2.0, gt=0.0, le=_LARGEST)
-    """How often the curve is flown, the parts in which speed rises and falls included."""
+    """Number of laps, including the parts in which speed rises and falls."""
     ramp_s: float = Field(default=2.0, gt=0.0, le=_LARGEST)
-    """Time from rest to full speed, and back [s]; shortened if the laps take less."""
+    """Time from rest to full speed, and from full speed to rest [s]; shortened if the laps take less."""
 
 
 class CircleConfig(PeriodicConfig):
@@ -97,9 +97,9 @@ class FigureEightConfig(PeriodicConfig):
 
     kind: Literal["figure_eight"] = "figure_eight"
     length_m: float = Field(default=3.0, gt=0.0, le=_LARGEST)
-    """Size along x [m]."""
+    """Length along x [m]."""
     width_m: float = Field(default=1.5, gt=0.0, le=_LARGEST)
-    """Size along y [m]."""
+    """Width along y [m]."""
 
 
 class LissajousConfig(PeriodicConfig):
@@ -109,7 +109,7 @@ class LissajousConfig(PeriodicConfig):
     amplitude_m: Vector3 = (1.5, 0.75, 0.3)
     """Half the size along x, y, z [m]."""
     cycles: tuple[Cycles, Cycles, Cycles] = (1, 2, 3)
-    """Oscillations a lap along x, y, z."""
+    """Oscillations per lap along x, y, z."""
     phase_rad: Vector3 = (0.0, 0.0, 0.0)
     """Phase along x, y, z [rad]."""
 

@@ -43,14 +43,14 @@ NonNegative = Annotated[float, Field(ge=0.0)]
 
 
 class MultirotorConfig(BaseConfig):
-    """Parameters of a multirotor whose rotors all push along body z. What is 0 is not computed."""
+    """Parameters of a multirotor whose rotors all push along body z; terms with 0 are not computed."""
 
     mass_kg: Annotated[float, Field(gt=0.0)]
     """Mass [kg]."""
     inertia_kg_m2: tuple[Vector3, Vector3, Vector3]
     """Inertia about the centre of mass in B, as three rows [kg m^2]."""
     rotor_position_m: tuple[Vector3, ...]
-    """Hub of each rotor against the centre of mass in B [m]."""
+    """Position of each rotor hub relative to the centre of mass, in B [m]."""
     rotor_direction: tuple[Literal[-1, 1], ...]
     """Sign of each rotor's reaction torque about body z: 1 if it turns clockwise seen from above."""
     thrust_coefficient_n_s2: NonNegative
@@ -58,10 +58,9 @@ class MultirotorConfig(BaseConfig):
     torque_coefficient_n_m_s2: NonNegative
     """Reaction torque of a rotor per squared speed [N m/(rad/s)^2]."""
     rotor_thrust_scale: tuple[NonNegative, ...] = ()
-    """For each rotor, its thrust coefficient as a multiple of the common one, where they are not alike; 0: a
-    rotor that is lost."""
+    """Thrust coefficient of each rotor as a multiple of the common one; empty: 1 for all; 0: a lost rotor."""
     rotor_torque_scale: tuple[NonNegative, ...] = ()
-    """For each rotor, its torque coefficient as a multiple of the common one, where they are not alike."""
+    """Torque coefficient of each rotor as a multiple of the common one; empty: 1 for all."""
     rotor_drag_kg: NonNegative = 0.0
     """Drag of a rotor in its plane, per rotor speed and air speed [N/(rad/s)/(m/s)]."""
     rotor_inflow_kg: NonNegative = 0.0
@@ -73,7 +72,7 @@ class MultirotorConfig(BaseConfig):
     parasitic_drag_kg_m: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
     """Drag of the frame along body x, y, z per squared air speed [N/(m/s)^2]."""
     motor_time_constant_s: NonNegative = 0.0
-    """Time to close 63 % of a step in commanded rotor speed [s]; 0 means at once."""
+    """Time to close 63 % of a step in commanded rotor speed [s]; 0: no lag."""
     rotor_speed_min_rad_s: NonNegative = 0.0
     """Slowest speed of a rotor [rad/s]; commands below saturate there, as in the motor controller."""
     rotor_speed_max_rad_s: Annotated[float, Field(gt=0.0)]
@@ -83,11 +82,11 @@ class MultirotorConfig(BaseConfig):
     wind_m_s: WindVector = (0.0, 0.0, 0.0)
     """Velocity of the air in W [m/s]."""
     gusts: tuple[GustConfig, ...] = ()
-    """Discrete gusts, which add up."""
+    """Discrete gusts, which add up; empty: none."""
     turbulence: TurbulenceConfig | None = None
-    """Random wind; null: none."""
+    """Random wind (Dryden turbulence); null: none."""
     ground: GroundConfig | None = None
-    """A horizontal plane to land on; null: the vehicle falls for ever."""
+    """A horizontal plane to land on; null: there is none, and the vehicle can fall for ever."""
     command_ranges: CommandRangesConfig = CommandRangesConfig()
     """The largest commands that the vehicle accepts."""
 

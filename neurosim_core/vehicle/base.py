@@ -49,8 +49,8 @@ class VehicleConfig(BaseConfig):
     """Radius of the sphere around the vehicle that must not touch the scene [m]. Where `parameters.ground`
     is set, the sphere shrinks near that plane to end 1 cm above it: to land is no collision."""
     on_collision: Literal["end", "report"] = "end"
-    """end: the run stops at the first touch; report: it flies on, through things, and yields Collision
-    packets."""
+    """Response to contact with the scene. end: the run stops at the first contact; report: the vehicle flies
+    on, through things, and yields Collision packets."""
 
     @property
     def title(self) -> str:

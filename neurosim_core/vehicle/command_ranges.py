@@ -22,21 +22,21 @@ Range = Annotated[float, Field(gt=0.0, le=1e6)]
 
 
 class CommandRangesConfig(BaseConfig):
-    """The largest commands that a vehicle accepts. null stands for what its physics gives."""
+    """The largest commands that a vehicle accepts; null derives a limit from its physics."""
 
     beyond: Literal["clamp", "refuse"] = "clamp"
-    """What happens to a finite command beyond its range. clamp: the vehicle flies the nearest command within
-    it, and the clamped commands are counted; refuse: the command before stays in force."""
+    """Response to a finite command beyond its range. clamp: the vehicle flies the nearest command within it,
+    and the clamped commands are counted; refuse: the previous command stays in force."""
     thrust_max_n: Range | None = None
-    """Collective thrust [N]; null: that of all rotors at their highest speed."""
+    """Largest collective thrust [N]; null: that of all rotors at their highest speed."""
     speed_max_m_s: Range | None = None
-    """Length of a velocity [m/s]; null: the level top speed, at which drag takes all horizontal thrust, and
-    100 m/s at most."""
+    """Largest norm of a velocity [m/s]; null: the level top speed, at which drag takes all horizontal thrust,
+    and 100 m/s at most."""
     body_rate_max_rad_s: Range = 34.9
-    """Length of a body rate, and size of a yaw rate [rad/s]; 2,000 degrees/s is the full scale of the usual
-    gyroscopes. The gain `body_rate_max_rad_s` may limit a body rate further."""
+    """Largest norm of a body rate, and largest yaw rate [rad/s]; 2,000 degrees/s is the full scale of the
+    usual gyroscopes. The gain `body_rate_max_rad_s` may limit a body rate further."""
     position_max_m: Range = 10_000.0
-    """Size of each coordinate of a position [m]."""
+    """Largest absolute value of each coordinate of a position [m]."""
 
 
 class _Part(NamedTuple):

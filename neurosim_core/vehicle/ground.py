@@ -29,18 +29,18 @@ class GroundConfig(BaseConfig):
     height_m: Annotated[float, Field(ge=-1e6, le=1e6)] = 0.0
     """z of the plane in W [m]."""
     foot_position_m: Annotated[tuple[Vector3, ...], Field(min_length=1)] | None = None
-    """Where the vehicle touches the ground, in B [m]; null: below each hub, 5 cm under the centre
-    of mass."""
+    """Contact points of the vehicle, in B [m]; null: one below each rotor hub, 5 cm under the centre of
+    mass."""
     stiffness_n_m: Annotated[float, Field(gt=0.0, le=1e9)] = 2000.0
-    """Force on a foot per depth [N/m]."""
+    """Force on a contact point per depth of penetration [N/m]."""
     damping_s_m: Annotated[float, Field(ge=0.0, le=1e6)] = 2.0
-    """Share by which this force grows per speed of sinking [s/m]; 0: the vehicle bounces for ever."""
+    """Relative growth of this force per sinking speed [s/m]; 0: the vehicle bounces for ever."""
     friction: Annotated[float, Field(ge=0.0, le=100.0)] = 0.6
     """Coefficient of friction."""
     slip_speed_m_s: Annotated[float, Field(gt=0.0, le=1e3)] = 0.01
-    """Speed of slip at which friction reaches 71 % [m/s]; below, it is viscous."""
+    """Slip speed at which friction reaches 71 % [m/s]; below, it is viscous."""
     rotor_radius_m: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
-    """Radius of the rotors, for the ground effect [m]; 0: none."""
+    """Radius of the rotors, which sets the ground effect [m]; 0: no ground effect."""
 
 
 @wp.struct

@@ -346,12 +346,12 @@ class MultirotorVehicleConfig(VehicleConfig):
     """Name of the airframe: crazyflie, hummingbird or racer."""
     parameters: dict[str, Any] = Field(default_factory=dict)
     """Parameters to change, by name (see `MultirotorConfig`), of the airframe, such as {mass_kg: 0.6}, and of
-    what it flies in: {wind_m_s: [3, 0, 0], gusts: [{velocity_m_s: [5, 0, 0], start_s: 1, rise_s: 0.5,
-    hold_s: 2}], turbulence: {wind_20ft_m_s: 7.7}, ground: {height_m: 0, rotor_radius_m: 0.1}}. A gust without
-    hold_s stays for good."""
+    its environment: {wind_m_s: [3, 0, 0], gusts: [{velocity_m_s: [5, 0, 0], start_s: 1, rise_s: 0.5, hold_s:
+    2}], turbulence: {wind_20ft_m_s: 7.7}, ground: {height_m: 0, rotor_radius_m: 0.1}}. A gust without hold_s
+    stays for good."""
     integrator: Integrator = "rkmk4"
-    """rkmk4: fixed steps, and adaptive ones for intervals that these cannot resolve. dormand_prince: adaptive
-    steps only."""
+    """rkmk4: fixed steps of a Runge-Kutta-Munthe-Kaas method, adaptive ones for intervals that these cannot
+    resolve. dormand_prince: adaptive steps only."""
 
     @model_validator(mode="after")
     def _airframe_exists(self) -> MultirotorVehicleConfig:

@@ -59,12 +59,12 @@ class GustConfig(BaseConfig):
     velocity_m_s: WindVector
     """Velocity of the air at full strength, added to the wind, in W [m/s]: amplitude and direction."""
     start_s: Annotated[float, Field(ge=0.0, le=1e6)]
-    """When it begins [s]."""
+    """Start time [s]."""
     rise_s: Annotated[float, Field(gt=0.0, le=1e6)]
     """Time to full strength, and to fall from it [s]: length of the gust over air speed."""
     hold_s: Annotated[float, Field(ge=0.0, le=1e6)] | None = None
-    """How long it stays at full strength [s]; null: for good, as in MIL-F-8785C; 0: a single pulse of twice
-    `rise_s`, as in CS-25.341."""
+    """Time at full strength [s]; null: for good, as in MIL-F-8785C; 0: a single pulse of twice `rise_s`, as
+    in CS-25.341."""
 
 
 class TurbulenceConfig(BaseConfig):
@@ -74,11 +74,11 @@ class TurbulenceConfig(BaseConfig):
     """Mean wind at 20 ft above ground, which sets the intensity [m/s]: light 7.7, moderate 15.4, severe 23.1.
     It does not blow by itself: see `wind_m_s`."""
     altitude_m: Annotated[float, Field(ge=10 * _FOOT_M, le=1000 * _FOOT_M)] | None = None
-    """Height above ground that scale lengths and intensities are taken at [m]; null: that of the vehicle
-    above the ground (z = 0 without one) at each tick, within the 3.048 to 304.8 m that the model is for."""
+    """Height above ground for scale lengths and intensities [m]; null: that of the vehicle above the ground
+    (z = 0 without one) at each tick, within the 3.048 to 304.8 m that the model is for."""
     airspeed_m_s: Annotated[float, Field(gt=0.0, le=1000.0)] | None = None
-    """Speed at which the field passes the vehicle [m/s]; null: that of the vehicle against `wind_m_s`
-    at each tick, at least 1 m/s."""
+    """Speed at which the field passes the vehicle [m/s]; null: that of the vehicle relative to `wind_m_s` at
+    each tick, at least 1 m/s."""
     sample_s: Annotated[float, Field(ge=1e-4, le=1.0)] = 0.01
     """Time between two ticks of the turbulence [s]; linear in between. No step is longer."""
 

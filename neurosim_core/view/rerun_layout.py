@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from neurosim_core.packets import FieldSchema, PacketSchema
 from neurosim_core.record.header import SensorDescription
+from neurosim_core.registry import find
 from neurosim_core.view.rerun_sdk import TIMELINE, import_rerun
 
 ROLLING_PLOT_S = 10.0
@@ -54,15 +55,15 @@ def body(vehicle: str) -> str:
 def overlays(sensors: Sequence[SensorDescription]) -> dict[str, str]:
     """Return the cameras whose pictures are drawn over those of a colour camera, and which that is.
 
-    They measure labels or flow where the other one is, through the same lens.
+    The other one is at the same place, and has the same lens.
     """
 
     def view(camera: SensorDescription) -> tuple[Any, ...]:
         return (*camera.position, *camera.orientation, camera.intrinsics)
 
-    below = {view(s): s.name for s in sensors if s.kind in ("rgb", "frame_camera")}
-    above = [s for s in sensors if s.kind in ("instance", "semantic", "optical_flow")]
-    return {s.name: below[view(s)] for s in above if view(s) in below}
+    kinds: dict[str, Any] = {s.kind: find("sensor", s.kind) for s in sensors}
+    below = {view(s): s.name for s in sensors if getattr(kinds[s.kind], "encoding", "") == "rgb8"}
+    return {s.name: below[view(s)] for s in sensors if kinds[s.kind].is_overlay and view(s) in below}
 
 
 def picture_panel(vehicle: str, sensor: str, kind: str = "", *, below: str = "") -> Panel:

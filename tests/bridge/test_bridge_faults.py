@@ -237,7 +237,7 @@ def test_a_flood_of_events_neither_stalls_nor_grows_and_is_accounted_for(ros, st
 
 
 def accounted(health: Listener, count: int) -> bool:
-    """Return whether all packets were received, and each was sent or lost: the last one may be on its way."""
+    """Return whether all packets were received, and each was sent or lost: the last one may be in flight."""
     values = diagnostics(health).get("/drone/events -> /drone/events", {})
     received, sent, lost = (int(values.get(name, 0)) for name in ("received", "sent", "lost"))
     return received == sent + lost == count

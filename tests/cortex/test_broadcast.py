@@ -63,10 +63,10 @@ class Ring:
             self.path, SOURCE, len(self.readers) + 1, self._idle[0].fileno(), nothing, zmq.Again, 20
         )
         connection = native.accept(self.listener)
-        source, number, page, bell = native.hear(connection)
+        source, number, page, wakeup = native.hear(connection)
         assert (source, number) == (SOURCE, len(self.readers) + 1)
         assert reader.welcomed() is None
-        member = self.writer.add(connection, page, bell, strict, timeout_ms, 5)
+        member = self.writer.add(connection, page, wakeup, strict, timeout_ms, 5)
         assert reader.welcomed() == 5
         self.readers.append(reader)
         return reader, member
@@ -141,7 +141,7 @@ def test_every_reliable_reader_gets_every_frame_in_order(ring, largest):
 
 
 def test_threads_read_while_the_publisher_writes(ring):
-    """Each sleeps until the bell rings; it waits for the slowest, and nobody loses anything."""
+    """Each sleeps until it is woken; it waits for the slowest, and nobody loses anything."""
     count = 20_000
 
     def read(reader) -> list[int]:
@@ -259,7 +259,7 @@ def test_the_last_frame_finds_room_and_outlives_the_publisher(ring):
     assert read_all(reader) == list(range(count + 1))
 
 
-def test_the_bell_rings_for_a_frame_after_none_was_there(ring):
+def test_the_wakeup_is_signalled_for_a_frame_after_none_was_there(ring):
     """Once, not for each frame; and never while nothing has come."""
     reader, _ = ring.join(strict=True)
     poll = select.poll()
@@ -406,27 +406,27 @@ def test_what_lies_in_a_ring_that_cannot_be_mapped_is_lost(make_node, start_chil
 
 
 @contextlib.contextmanager
-def asks_by_hand(path: str, source: int, magic: bytes = b"CTXCAST3", bell: int | None = None):
+def asks_by_hand(path: str, source: int, magic: bytes = b"CTXCAST3", wakeup: int | None = None):
     """The connection of a reader, number 1, that has said hello."""
-    page, bell = os.memfd_create("page", os.MFD_ALLOW_SEALING), os.eventfd(0) if bell is None else bell
+    page, wakeup = os.memfd_create("page", os.MFD_ALLOW_SEALING), os.eventfd(0) if wakeup is None else wakeup
     os.ftruncate(page, 4096)
     fcntl.fcntl(page, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as other:
         other.connect(path)
-        socket.send_fds(other, [magic + struct.pack("<QQ", source, 1)], [page, bell])
+        socket.send_fds(other, [magic + struct.pack("<QQ", source, 1)], [page, wakeup])
         os.close(page)
-        os.close(bell)
+        os.close(wakeup)
         yield other
 
 
 @pytest.mark.parametrize(
     "make", [os.pipe, lambda: [end.detach() for end in socket.socketpair()]], ids=["pipe", "socket"]
 )
-def test_a_bell_whose_ringing_would_end_the_process_is_refused(ring, make):
+def test_a_wakeup_whose_signal_would_end_the_process_is_refused(ring, make):
     """Nobody is at its other end: to write there sends SIGPIPE."""
-    other, bell = make()
+    other, wakeup = make()
     os.close(other)
-    with asks_by_hand(ring.path, SOURCE, bell=bell):
+    with asks_by_hand(ring.path, SOURCE, wakeup=wakeup):
         connection = native.accept(ring.listener)
         with pytest.raises(OSError, match=r"[Pp]rotocol"):
             native.hear(connection)
@@ -554,7 +554,7 @@ def test_a_reader_that_leaves_before_it_attaches_is_forgotten(tmp_path):
     leaving.close()
     after_close = len(os.listdir("/proc/self/fd"))
     listener.forget()
-    assert len(os.listdir("/proc/self/fd")) == after_close - 3  # socket, page and bell
+    assert len(os.listdir("/proc/self/fd")) == after_close - 3  # socket, page and wakeup
     assert listener.take(SOURCE, 1) is None
     hello = listener.take(SOURCE, 2)
     assert hello is not None

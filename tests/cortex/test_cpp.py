@@ -76,7 +76,7 @@ def test_vectors_and_damaged_bodies(programs):
 
 
 def test_a_peer_that_writes_at_random(programs, tmp_path):
-    """Into a ring and its slots, a page, a bell, a connection: it hurts itself only (ASan, UBSan)."""
+    """Into a ring and its slots, a page, a wakeup, a connection: it hurts itself only (ASan, UBSan)."""
     run_program([programs / "hostile_test", tmp_path, str(HOSTILE_WRITES), "1"])
 
 

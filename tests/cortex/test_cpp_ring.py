@@ -117,7 +117,7 @@ def test_reader_of_a_socket_that_stands_still_holds_up_a_cpp_publisher_once(
     writer = start(*role, 250_000)  # 1 MB each
     assert scans.wait_for_publisher(SOON_S)
     result = result_of(writer)
-    if timeout_s < 1.0:  # what is on its way besides: in the kernel, and one in the queue of the reader
+    if timeout_s < 1.0:  # what is in flight besides: in the kernel, and one in the queue of the reader
         assert 8 <= result["taken"] <= 12
     else:
         assert result["refused"] >= 28
@@ -269,9 +269,9 @@ class RingImpostor(Impostor):
 
     def take_in(self, key: bytes, *, answers: bool = True) -> None:
         fd = native.accept(self.listener)
-        source, number, page, bell = native.hear(fd)
+        source, number, page, wakeup = native.hear(fd)
         assert (source, number) == (self.SOURCE, int.from_bytes(key[16:24], "little"))
-        self.ring.add(fd, page, bell, False, 0, 0)
+        self.ring.add(fd, page, wakeup, False, 0, 0)
         if answers:
             self.xpub.send(wire.answer_frame(key, wire.AttachAnswer(0, b"")))
 

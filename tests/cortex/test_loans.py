@@ -153,11 +153,11 @@ SHAPE = (60, 480, 3)
 DIMS = dict(zip(("height", "width", "channels"), SHAPE, strict=True))
 
 
-@pytest.fixture(params=["as it is", "the long way"])
+@pytest.fixture(params=["as it is", "the slow path"])
 def way(request, monkeypatch):
-    """What the short cut said of each message; without the C module there is only the long way."""
+    """What the fast path said of each message; without the C module there is only the slow path."""
     send, taken = Publisher._send_loaned, []
-    if request.param == "the long way":
+    if request.param == "the slow path":
         monkeypatch.setattr(Publisher, "_send_loaned", lambda *_: None)
     else:
         monkeypatch.setattr(Publisher, "_send_loaned", lambda *args: taken.append(send(*args)) or taken[-1])

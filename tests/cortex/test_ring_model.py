@@ -169,12 +169,12 @@ def test_the_machine_reorders_and_orders_as_it_says():
 
 @pytest.mark.parametrize("left_out", [None, "publisher", "reader"], ids=str)
 def test_who_sleeps_is_woken(left_out):
-    """The reader has seen no frame and sleeps: then the bell rings."""
-    rings = "release head 1, fence, skip unless sleeping 1 2, exchange sleeping 0, store bell 1"
-    publisher = program(rings, "fence" if left_out == "publisher" else "")
+    """The reader has seen no frame and sleeps: then the wakeup is signalled."""
+    wakes = "release head 1, fence, skip unless sleeping 1 2, exchange sleeping 0, store wakeup 1"
+    publisher = program(wakes, "fence" if left_out == "publisher" else "")
     reader = program("store sleeping 1, fence, load head", "fence" if left_out == "reader" else "")
-    ends = explore({"head": 0, "sleeping": 0, "bell": 0}, publisher, reader)
-    overslept = [memory for memory, (_, read) in ends if read["head"] == 0 and not memory["bell"]]
+    ends = explore({"head": 0, "sleeping": 0, "wakeup": 0}, publisher, reader)
+    overslept = [memory for memory, (_, read) in ends if read["head"] == 0 and not memory["wakeup"]]
     assert bool(overslept) == (left_out is not None)
 
 

@@ -311,7 +311,7 @@ def test_the_connection_to_a_publisher_that_left_is_closed(node, policy, how, mo
 
 
 def test_a_publisher_that_left_is_let_go_while_another_waits_for_room(node, monkeypatch):
-    """All that came of it was read; that more of the other is on its way is nothing to it."""
+    """All that came of it was read; that more of the other is in flight is nothing to it."""
     monkeypatch.setattr("cortex.subscriber.LEAVING_NS", 0)
     subscriber = node.subscriber("/numbers", Number, policy=reliable(4, 60.0))
     busy = node.publisher("/numbers", Number)

@@ -111,7 +111,7 @@ def a_publisher_closes(node, child, start_child, generator, tmp_path):
 
 
 def connections_are_cut(node, child, start_child, generator, tmp_path):
-    """Those that the reader has to its publisher; ZeroMQ makes new ones, and what was on its way is lost.
+    """Those that the reader has to its publisher; ZeroMQ makes new ones, and what was in flight is lost.
 
     With it the end, or not: without it nobody may believe to have heard all.
     """
@@ -154,7 +154,7 @@ def test_a_connection_fails_for_good_in_silence(make_node, start_child, before, 
 
 
 def a_publisher_is_killed(node, child, start_child, generator, tmp_path):
-    """What was on its way is lost, nobody knows how much: the reader counts that the stream was cut off."""
+    """What was in flight is lost, nobody knows how much: the reader counts that the stream was cut off."""
     count_file = tmp_path / "published"
     count_file.write_bytes(bytes(8))
     victim = start_child(

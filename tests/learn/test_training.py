@@ -26,8 +26,8 @@ from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
 from neurosim_core.learn.evaluate import (  # noqa: E402
     EPISODE_SEED,
     evaluate_policy,
-    film_episode,
-    film_sensors,
+    record_episode,
+    recording_sensors,
     student_actor,
     teacher_actor,
 )
@@ -341,11 +341,11 @@ def test_a_policy_sees_voxels_of_both_signs():
     assert not torch.allclose(seen[0], seen[1])
 
 
-def test_an_evaluation_films_the_first_of_its_episodes(tmp_path, hall):
-    """The recording that a film is made of begins where the first world does, and goes the same way."""
+def test_an_evaluation_animates_the_first_of_its_episodes(tmp_path, hall):
+    """The recording that an animation is made of begins where the first world does, and goes the same way."""
     run(tmp_path, hall)
     scene, file = str(hall.config.scene.file), tmp_path / "flight.h5"
-    (_, evaluation), *_ = evaluate_run(tmp_path, scenes=scene, worlds=1, film=file)
+    (_, evaluation), *_ = evaluate_run(tmp_path, scenes=scene, worlds=1, animation=file)
     with ns.Recording(file) as flight:
         poses, pictures = (list(flight.packets(name)) for name in ("odometry", "rgb"))
         assert [packet.stamp_ns for packet in poses] == [20_000_000 * step for step in range(21)]
@@ -360,11 +360,11 @@ def test_an_evaluation_films_the_first_of_its_episodes(tmp_path, hall):
     speed_m_s = np.linalg.norm(poses[-1].velocity)
     assert evaluation.metrics["speed_m_s"] == pytest.approx(speed_m_s, rel=1e-5)  # float32
     film = tmp_path / "film.webp"
-    next(evaluate_run(tmp_path, scenes=scene, worlds=1, film=film))
+    next(evaluate_run(tmp_path, scenes=scene, worlds=1, animation=film))
     with Image.open(film) as frames:
         assert frames.n_frames == 5
     env = ns.learn.make_env(
-        "brief-hover", worlds=2, device="cpu", scenes=[scene], sensors=film_sensors(env.task)
+        "brief-hover", worlds=2, device="cpu", scenes=[scene], sensors=recording_sensors(env.task)
     )
     act = student_actor(load_student(tmp_path, env.device), env)
 
@@ -372,7 +372,7 @@ def test_an_evaluation_films_the_first_of_its_episodes(tmp_path, hall):
         env.episode_length[1] = env.episode_steps
         return act(observations, begun)
 
-    film_episode(env, acting, tmp_path / "again.h5")
+    record_episode(env, acting, tmp_path / "again.h5")
     with ns.Recording(tmp_path / "again.h5") as flight:
         # a network rounds otherwise for two worlds than for one
         np.testing.assert_allclose(flight.events("front", 0.0, 0.5).t, events.t, atol=20)

@@ -326,7 +326,7 @@ def test_when_commands_come_does_not_matter(model, shared_runtime):
 
 
 def test_after_a_reset_it_is_the_first_flight(model, shared_runtime):
-    """In the middle of a flight, with an answer to the flight before on its way."""
+    """In the middle of a flight, with an answer to the flight before outstanding."""
     expected = list(run_model(model, make_state(model)))
     with serving(model) as result, Node("controller") as node:
         listener = Listener(node)

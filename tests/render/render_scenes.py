@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import trimesh
 import warp as wp
+from core_counts import cores
 
-from neurosim_core.render import launch
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.scene_arrays import SceneArrays, upload_scene
@@ -95,11 +93,6 @@ def textured_plane(texture: Texture, *, size_m: float, repeats: float = 1.0) -> 
     )
 
 
-def on_cores(count: int | None) -> AbstractContextManager[Any]:
-    """Launch on so many cores, whatever the machine has; None: as it has."""
-    return nullcontext() if count is None else mock.patch.object(launch, "core_count", return_value=count)
-
-
 def render(
     scene: Scene | SceneArrays,
     lens: PinholeConfig,
@@ -119,7 +112,7 @@ def render(
     position = wp.array(np.array([p for p, _ in poses], np.float32), dtype=wp.vec3, device=device)
     orientation = wp.array(np.array([q for _, q in poses], np.float32), dtype=wp.quat, device=device)
     slot = wp.array(np.array(slots or range(len(poses)), np.int32), dtype=int, device=device)
-    with on_cores(thread_count):
+    with cores(thread_count):
         for _ in range(launches):
             renderer.render(position, orientation, slot, instant_count=count)
     return {name: getattr(renderer, name).numpy().copy() for name in outputs}

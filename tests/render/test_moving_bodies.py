@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
-from render_scenes import LUMA, UNSHADOWED, box, on_cores, plane, point_light, scene_of
+from core_counts import cores
+from render_scenes import LUMA, UNSHADOWED, box, plane, point_light, scene_of
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.frames import Q_FORWARD_OPTICAL
@@ -68,7 +69,7 @@ def look(scene, bodies, poses, stamps_ns, *, config=UNSHADOWED, device="cpu", th
     poses = poses * count if len(poses) == 1 else poses
     positions = wp.array(np.array([p for p, _ in poses], np.float32), dtype=wp.vec3, device=device)
     orientations = wp.array(np.array([q for _, q in poses], np.float32), dtype=wp.quat, device=device)
-    with on_cores(threads):
+    with cores(threads):
         renderer.render(positions, orientations, slot, instant_count=count, bodies=where)
     return {name: getattr(renderer, name).numpy().copy() for name in OUTPUTS}, arrays.instance_names
 

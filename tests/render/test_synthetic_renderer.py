@@ -1,4 +1,4 @@
-"""The test card: which instant a picture shows, that frames differ and depend on nothing but the pose."""
+"""The test pattern: which instant a picture shows, that frames differ and depend on nothing but the pose."""
 
 from __future__ import annotations
 

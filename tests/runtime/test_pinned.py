@@ -14,7 +14,6 @@ import warp as wp
 from neurosim_core.runtime import pinned
 from neurosim_core.runtime.cuda import Fence, GraphCache, HostCopy
 from neurosim_core.runtime.pinned import PinError, PinnedMapping
-from neurosim_core.sim.cameras import launch_key
 
 
 class Driver:
@@ -77,22 +76,6 @@ def test_without_a_driver(monkeypatch):
     pinned._driver.cache_clear()
     with pytest.raises(PinError, match="cannot open"):
         pinned._driver()
-
-
-def test_launches_are_others_when_memory_was_pinned_anew(memory, monkeypatch):
-    """The same addresses may be those of a mapping that is gone: a graph of them is not replayed."""
-    monkeypatch.setattr(pinned, "_driver", Driver)
-    room = np.zeros((2, 3), dtype=np.uint8)
-    job: Any = SimpleNamespace(
-        pattern="job",
-        group=SimpleNamespace(allocate_picture=True),
-        picture_buffers={("rgb", 0): room},
-        pictures=((0, 0, "rgb"), (5, 1, "rgb")),
-    )
-    before = launch_key(job)
-    assert launch_key(job) == before
-    PinnedMapping(memory, "cpu")
-    assert launch_key(job) != before
 
 
 @pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device")

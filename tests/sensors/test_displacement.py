@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 import warp as wp
+from core_counts import cores
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -20,7 +21,6 @@ from neurosim_core.render.scene_arrays import SceneArrays, upload_scene
 from neurosim_core.render.warp_renderer import WarpRenderer
 from neurosim_core.scene.bodies import BodyConfig, make_bodies
 from neurosim_core.scene.scene import Material, Scene
-from neurosim_core.sensors import displacement
 from neurosim_core.sensors.displacement import DisplacementRule
 
 RATE = Rate(1000.0)
@@ -247,19 +247,19 @@ def test_the_choice_does_not_depend_on_how_a_flight_is_cut(arrays, cuts):
 
 
 @pytest.mark.parametrize("moving", [False, True], ids=["still", "body"])
-def test_the_choice_does_not_depend_on_what_a_cpu_does_at_once(arrays, moving, monkeypatch):
-    """Blocks of ticks and threads are a matter of cost."""
+def test_the_choice_does_not_depend_on_the_number_of_cores(arrays, moving):
+    """They share what a picture of this size needs."""
     if moving:
         arrays = with_body(size_m=(0.3, 0.2, 0.02), position_m=(0.1, 0.0, 1.0), spin_rad_s=(0.0, 0.0, 3.0))
-    states = flight(300, v_W=(0.3, -0.2, 0.5), w_B=(0.2, 0.4, -0.1))
+    large = PinholeConfig(width=480, height=360, fx=300.0, fy=300.0, cx=240.0, cy=180.0)
+    states = flight(150, v_W=(0.3, -0.2, 0.5), w_B=(0.2, 0.4, -0.1))
     found = []
-    for block, split_min in ((128, 1 << 14), (300, 1), (64, 1), (7, 1 << 14)):
-        monkeypatch.setattr(displacement, "_BLOCK", block)
-        monkeypatch.setattr(displacement, "_SPLIT_MIN", split_min)
-        rule = make_rule(arrays)
-        found.append((choose(rule, states, forced={77, 78}), rule.coarse_count))
-    assert found.count(found[0]) == len(found)
-    assert 20 < len(found[0][0]) < 200
+    for count in (1, 3):
+        with cores(count):
+            rule = make_rule(arrays, limit_px=2.5, lens=large)
+            found.append((choose(rule, states, forced={77, 78}), rule.coarse_count))
+    assert found[0] == found[1]
+    assert 10 < len(found[0][0]) < 100
 
 
 def test_the_bound_holds_for_every_pixel_of_a_cluttered_scene():

@@ -13,16 +13,14 @@ import numpy as np
 import pytest
 import trimesh
 from controller_commands import command_of
+from core_counts import cores
 
 import neurosim_core as ns
 from neurosim_core import sim
 from neurosim_core.control import Controller
 from neurosim_core.packets import Collision, Events, Image, ImuSample, Odometry, Packet
-from neurosim_core.render import launch
 from neurosim_core.runtime import cuda
-from neurosim_core.sim import render_group
-from neurosim_core.sim.cameras import plan_job
-from neurosim_core.sim.integrate import plan_batch
+from neurosim_core.runtime.pinned import PinnedMapping
 from neurosim_core.vehicle import DynamicsError
 
 LENS = {"width": 48, "height": 36, "horizontal_fov_rad": 1.5}
@@ -127,36 +125,6 @@ def test_two_runs_give_the_same_bytes(settings):
 @pytest.mark.parametrize("instants", [1, 3, 64])
 def test_packets_do_not_depend_on_the_size_of_a_launch(settings, instants):
     assert content(fly(settings, instants_per_launch=instants)) == content(fly(settings))
-
-
-def test_terms_are_those_that_the_kernels_have(settings):
-    """Walks are shared or not by the lens, the launch and the device, not by the scene alone."""
-    found = {}
-    for walk in (None, {"instants": 4}):
-        render = {**settings["render"], "cpu_traversal": "warp", "candidate_lists": walk}
-        model = sim.make_model(ns.load_config({**settings, "render": render}))
-        (group,) = sim.make_state(model).groups
-        found[walk is None] = set(render_group.render_terms(group))
-    assert found[False] - found[True] == {"candidate_group"} | (
-        {"by_tile"} if settings["device"] == "cpu" else set()
-    )
-    assert not found[True] & {"candidate_group", "by_tile", "fallback"}
-
-
-def test_batches_in_flight_share_no_list_of_slots(settings):
-    """A list is uploaded on the stream of one batch in flight; those of the others do not wait for it."""
-    model = sim.make_model(ns.load_config(settings))
-    state = sim.make_state(model, in_flight=2)
-    sim.start(model, state)
-    batch = plan_batch(state, model.schedule.stretch(0, 4_000_000), closed_loop=True)
-    later = dataclasses.replace(batch, number=batch.number + 1)  # the same slots of the trace
-    first, again, other = (plan_job(state, each, 0, [0, 1]) for each in (batch, batch, later))
-    for name in ("from_slots", "to_slots"):
-        mine, repeated, theirs = (getattr(job, name) for job in (first, again, other))
-        assert mine is repeated
-        assert mine.ptr != theirs.ptr
-        assert mine.numpy().tolist() == theirs.numpy().tolist()
-    assert first.from_slots.numpy().tolist() == [batch.slot, batch.slot + 1]
 
 
 @pytest.mark.parametrize("lane_count", [1, 2, 3])
@@ -483,6 +451,33 @@ class LateCopies:
         monkeypatch.setattr(cuda.Fence, "wait", wait)
 
 
+def test_launches_are_others_when_memory_was_pinned_anew(settings, monkeypatch):
+    """The same addresses may be those of a mapping that is gone: a graph of them is not replayed."""
+    keys: list[Any] = []
+
+    def launch(graphs: cuda.GraphCache, key: Any, launch: Callable[[], Any], **_: Any) -> None:
+        keys.append(key)
+        launch()
+
+    monkeypatch.setattr(cuda.GraphCache, "run", launch)
+    sensors = {"rgb": {**SENSORS["rgb"], "rate_hz": 200}}
+    model = sim.make_model(ns.load_config({**settings, "device": "cpu", "sensors": sensors}))
+    room = np.zeros((LENS["height"], LENS["width"], 3), np.uint8)
+    state = sim.make_state(model, in_flight=1, allocate_picture=lambda *_: room)
+    for _ in range(8):
+        sim.step(model, state, None)
+    known = set(keys)
+    assert len(known) < len(keys)
+    keys.clear()
+    sim.step(model, state, None)
+    again = set(keys)
+    monkeypatch.setattr(PinnedMapping, "made_count", PinnedMapping.made_count + 1)
+    keys.clear()
+    sim.step(model, state, None)
+    assert again <= known
+    assert set(keys) - known
+
+
 @pytest.mark.parametrize("names", [("rgb",), ("rgb", "depth"), ("events", "rgb", "depth")])
 def test_a_device_writes_pictures_into_room_of_the_caller(settings, monkeypatch, names):
     """They are there after `settle`; nothing waits for them where there is nothing else."""
@@ -711,11 +706,11 @@ def test_adaptive_events_do_not_depend_on_batches(settings, lane_count, instants
     assert content(got) == content(expected)
 
 
-def test_adaptive_events_do_not_depend_on_the_number_of_threads(settings, monkeypatch):
+def test_adaptive_events_do_not_depend_on_the_number_of_threads(settings):
     runs = []
     for count in (1, 3):
-        monkeypatch.setattr(launch, "core_count", lambda count=count: count)
-        runs.append(content(fly(settings, sensors=ADAPTIVE)))
+        with cores(count):
+            runs.append(content(fly(settings, sensors=ADAPTIVE)))
     assert runs[0] == runs[1]
 
 

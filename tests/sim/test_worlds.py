@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import weakref
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
+from allocations import allocations
+from core_counts import cores
 from world_rig import RIG, UNSHADOWED, assert_same, commands_of, fly_alone, room, scene_of, settings, snapshot
 
 import neurosim_core as ns
 from neurosim_core.packets import Collision, Events
-from neurosim_core.render import launch, scene_arrays
-from neurosim_core.sensors import event_pixels, event_worlds
+from neurosim_core.runtime import cuda
 from neurosim_core.sim import Simulation, StartState
-from neurosim_core.sim import simulation as worlds_module
 from neurosim_core.vehicle.arrays import STATUS_TERMS
 
 
@@ -131,25 +134,23 @@ def test_pixels_and_lenses_of_their_own(noisy, plain, device):
             assert_same(seen[step][world], packets)
 
 
-@pytest.mark.parametrize("form", ["tiles", "blocks", "blocks that leave too much"])
-def test_walks_that_rays_share(textured, monkeypatch, form):
-    """The instants of a tile share a walk through the tree in each world, which changes nothing.
+@pytest.mark.parametrize(("by_tile", "limit"), [(True, 256), (False, 256), (False, 2)])
+def test_walks_that_rays_share(textured, by_tile, limit):
+    """The instants of a tile share a search of the tree in each world, which changes nothing.
 
-    Tile by tile, as on a CPU, and as blocks of CUDA do it, which leave pixels to another kernel.
+    Tile by tile, as on a CPU, and as blocks of CUDA do it, which leave pixels to another kernel, and with
+    short lists more pixels than there is room for.
     """
-    if form != "tiles":
-        ours = scene_arrays._terms_of
-        monkeypatch.setattr(scene_arrays, "_terms_of", lambda *a, **k: ours(*a, **k)._replace(by_tile=False))
     front = {**RIG["front"], "sampling_rate_hz": 600}  # 6 instants: 4 together, then 2
     rig = {"front": front, "rgb": RIG["rgb"]}
-    limit = 2 if "too much" in form else 256
     walking = {**UNSHADOWED, "candidate_lists": {"face_count_max": limit}}
     commands = commands_of("rates", 4, 2)
-    worlds = Simulation(settings(textured, sensors=rig, render=walking), worlds=2)
-    seen = record(worlds, commands)
-    walk = worlds._state.groups[0].buffers[0].renderer.candidates
-    left, left_room = int(walk.data.unresolved_count.numpy()[0]), walk.data.unresolved.shape[0]
-    assert (left > 0, left > left_room) == (form != "tiles", "too much" in form)
+    config = settings(textured, sensors=rig, render=walking)
+    model = ns.make_model(ns.load_config(config))
+    arrays: Any = model.scene_on_device
+    arrays = dataclasses.replace(arrays, terms=arrays.terms._replace(by_tile=by_tile))
+    shared = dataclasses.replace(model, scene_on_device=arrays)
+    seen = record(Simulation(config, worlds=2, models=[shared]), commands)
     for world in range(2):
         for render in (walking, {**UNSHADOWED, "cpu_traversal": "warp", "candidate_lists": None}):
             config = settings(textured, seed=7 + world, sensors=rig, render=render)
@@ -202,7 +203,6 @@ def test_walks_that_cannot_be_shared(several, plain, textured, caplog):
         for walk in ({}, {"candidate_lists": {}})
     ]
     assert caplog.text.count("render.candidate_lists is left out") == 1
-    assert made[0]._scenes.terms == made[1]._scenes.terms
     commands = commands_of("rates", 3, 2)
     plainly, walking = (record(worlds, commands) for worlds in made)
     assert event_count(plainly) > 100
@@ -375,22 +375,20 @@ def test_a_motion_that_cannot_be_integrated_holds_one_world(plain):
     assert not worlds.reset().status.numpy().any()
 
 
-def test_neither_batch_nor_threads_change_a_byte(plain, monkeypatch):
+def test_neither_batch_nor_threads_change_a_byte(plain):
     """Four worlds together are two and two, on one core or three."""
     rig = {"front": RIG["front"], "rgb": RIG["rgb"], "imu": RIG["imu"]}
     commands = commands_of("rates", 4, 4)
     together = record(Simulation(settings(plain, sensors=rig), worlds=4), commands)
-    for cores in (1, 3):
-        for module in (launch, event_pixels, event_worlds):
-            monkeypatch.setattr(module, "core_count", lambda cores=cores: cores)
-        for first in (0, 2):
+    for core_count, first in itertools.product((1, 3), (0, 2)):
+        with cores(core_count):
             half = Simulation(settings(plain, sensors=rig), worlds=2, seeds=[7 + first, 8 + first])
             apart = record(half, commands[:, first : first + 2])
-            for step, worlds in enumerate(apart):
-                for index, seen in enumerate(worlds):
-                    for name in ("front", "imu", "state"):
-                        for a, b in zip(seen[name], together[step][first + index][name], strict=True):
-                            np.testing.assert_array_equal(a, b)
+        for step, worlds in enumerate(apart):
+            for index, seen in enumerate(worlds):
+                for name in ("front", "imu", "state"):
+                    for a, b in zip(seen[name], together[step][first + index][name], strict=True):
+                        np.testing.assert_array_equal(a, b)
 
 
 def test_events_that_are_not_sorted(plain):
@@ -470,16 +468,7 @@ def test_a_step_allocates_nothing(plain):
     commands = commands_of("rates", 8, 2)
     for command in commands[:4]:
         worlds.step(command)
-    made = []
-    original = wp.array.__init__
-
-    def counted(self: Any, *args: Any, **kwargs: Any) -> None:
-        if kwargs.get("ptr") is None:
-            made.append(kwargs)
-        original(self, *args, **kwargs)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(wp.array, "__init__", counted)
+    with allocations() as made:
         for command in commands[4:]:
             worlds.step(command)
     assert made == []
@@ -549,32 +538,43 @@ def test_models_that_were_made_before(plain, textured):
             Simulation(config, worlds=2, **none)
 
 
-def test_patterns_that_never_come_again(plain, monkeypatch, caplog):
-    """What is kept of them is bounded, and that graphs are given up is said once."""
-    monkeypatch.setattr(worlds_module, "STRETCH_COUNT_MAX", 3)
-    rig = {
-        "front": {**RIG["front"], "sampling_rate_hz": 59.94, "packet_rate_hz": 59.94},
-        "imu": {**RIG["imu"], "rate_hz": 333.333},
-    }
-    config = settings(plain, sensors=rig)
+def test_patterns_that_never_come_again(plain):
+    """They change no event, and what is kept of them is bounded."""
+    imu = {**RIG["imu"], "rate_hz": 333.333}
+    front = {**RIG["front"], "sampling_rate_hz": 59.94, "packet_rate_hz": 59.94}
+    config = settings(plain, sensors={"front": front, "imu": imu})
     commands = commands_of("rates", 12, 1)
-    worlds = Simulation(config, worlds=1)
-    seen = record(worlds, commands)
-    assert len(worlds._observations) <= 3
+    seen = record(Simulation(config, worlds=1), commands)
     packets = [p for step in fly_alone(config, commands[:, 0]) for p in step]
     found = [p.numpy() for p in packets if isinstance(p, Events)]
     for column, expected in zip(in_order([s[0]["front"] for s in seen]), in_order(found), strict=True):
         np.testing.assert_array_equal(column, expected)
+    worlds = Simulation(settings(plain, sensors={"imu": imu}), worlds=1)
+    worlds.reset()
+    observations = [weakref.ref(worlds.step()) for _ in range(5000)]
+    assert sum(observation() is not None for observation in observations) <= 4096
+
+
+def test_that_graphs_are_given_up_is_said_once(plain, monkeypatch, caplog):
+    """A CUDA device gives them up where patterns are too many."""
+
+    def give_up(graphs: cuda.GraphCache, key: Any, launch: Callable[[], Any], **_: Any) -> None:
+        graphs.dropped_count += 1
+        launch()
+
+    worlds = Simulation(settings(plain, sensors={"front": RIG["front"]}), worlds=1)
+    worlds.reset()
+    worlds.step()
     assert not caplog.records
-    worlds._state.pipeline.graphs.dropped_count = 1  # as on a CUDA device
-    for command in commands[:2]:
-        worlds.step(command)
+    monkeypatch.setattr(cuda.GraphCache, "run", give_up)
+    for _ in range(2):
+        worlds.step()
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert "more patterns than there is room for graphs" in caplog.text
 
 
 def test_more_than_32_bits_can_count(plain):
-    """Said before anything is allocated: rooms for events, and the lists of shared walks."""
+    """Said before anything is allocated: event buffers, and candidate lists."""
     lens = {"width": 640, "height": 480, "horizontal_fov_rad": 1.5}
     rig = {"front": {**RIG["front"], "lens": lens, "sampling_rate_hz": 100}}
     with pytest.raises(ValueError, match="4096 worlds with room for 614400 events each"):

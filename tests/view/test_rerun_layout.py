@@ -9,7 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neurosim_core.packets import PACKET_CLASSES, schema_of
-from neurosim_core.view.rerun_layout import make_blueprint, sensor_panels
+from neurosim_core.record import describe_sensors
+from neurosim_core.registry import find
+from neurosim_core.view.rerun_layout import make_blueprint, overlays, sensor_panels
 
 SIZES = st.floats(0.5, 200.0)
 
@@ -102,6 +104,17 @@ def test_an_overlay_has_a_panel_with_the_picture_below_and_is_not_in_the_scene()
     assert shown["surface"].contents == ["$origin/surface"]
     hidden = {rule for rule in shown["scene"].contents if rule.startswith("- ")}
     assert hidden == {"- /world/vehicles/drone/rgb/ids/**", "- /world/vehicles/drone/dvs/**"}
+
+
+def test_labels_and_flow_are_drawn_over_the_colour_camera_with_the_same_view():
+    lens = {"kind": "pinhole", "width": 32, "height": 24, "horizontal_fov_rad": 1.0}
+    kinds = ("depth", "instance", "semantic", "optical_flow", "edges", "imu", "odometry", "lidar")
+    for colored in ("rgb", "frame_camera"):
+        rig = {kind: find("sensor", kind)() for kind in (*kinds, colored)}
+        rig["elsewhere"] = find("sensor", "instance")(lens=lens)
+        over = overlays(describe_sensors(rig))
+        assert over == dict.fromkeys(("instance", "semantic", "optical_flow"), colored)
+    assert not overlays(describe_sensors({"ids": rig["instance"]}))
 
 
 def test_several_vehicles_have_tabs():

@@ -34,8 +34,8 @@ void follow(CortexReader reader) {
     const std::int64_t size = cortex_reader_peek(&reader, &data);
     if (size == 0) {
       if (cortex_reader_arm(&reader) == 0) continue;
-      pollfd look{reader.bell, POLLIN, 0};
-      expect(::poll(&look, 1, patience_ms) == 1, "the bell rings for whoever sleeps");
+      pollfd look{reader.wakeup, POLLIN, 0};
+      expect(::poll(&look, 1, patience_ms) == 1, "the wakeup is signalled for whoever sleeps");
       continue;
     }
     cortex_reader_disarm(&reader);
@@ -67,13 +67,13 @@ int main() {
     CortexMember& member = writer.members[index];
     member.used = member.strict = 1;
     member.page = &pages[static_cast<std::size_t>(index)];
-    member.bell = member.socket = ::eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);  // which never ends
+    member.wakeup = member.socket = ::eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);  // which never ends
     CortexReader reader{};
     reader.ring = writer.ring;
     reader.data = writer.data;
     reader.page = member.page;
     reader.capacity = capacity;
-    reader.bell = member.bell;
+    reader.wakeup = member.wakeup;
     threads.emplace_back(follow, reader);
   }
   for (std::uint64_t number = 0; number < count; ++number) {
@@ -84,7 +84,7 @@ int main() {
   }
   for (std::thread& thread : threads) thread.join();
   for (const CortexMember& member : writer.members) {
-    if (member.used) ::close(member.bell);
+    if (member.used) ::close(member.wakeup);
   }
   std::puts("ok");
 }

@@ -309,7 +309,7 @@ void be_attacked_by_a_publisher(const std::string& directory, std::uint64_t writ
                               counters, complaints);
     std::deque<cortex::detail::Item> queue, held;
     std::uint64_t accepted = 0;
-    for (int idle = 0; link.bell_fd() >= 0 && !publisher.done && idle < 500;) {
+    for (int idle = 0; link.wakeup_fd() >= 0 && !publisher.done && idle < 500;) {
       const bool none = in_time([&] { return link.drain(queue, 1); });
       publisher.steps.count();
       if (link.is_crowded()) link.pass_over();
@@ -458,7 +458,7 @@ class Attacked {
   bool publish(Attempt attempt, std::size_t size) {
     for (int tries = 0; tries < 8; ++tries) {
       const int found = attempt();
-      if (found == CORTEX_WRITTEN || found == CORTEX_LATE) return true;
+      if (found == CORTEX_WRITTEN || found == CORTEX_LAGGING) return true;
       expect(found == CORTEX_FULL, "a message fits");
       reliable_->read_all();
       if (cortex_writer_patience(&writer_, size) >= 0) cortex_writer_give_up(&writer_, size, 1000);
@@ -484,7 +484,7 @@ class Attacked {
     write_at(page + places[random() % 5], nasty(random, std::as_const(writer_).head), random);
     if (random() % 64 == 0) {
       const std::uint64_t count = nasty(random, 1);
-      if (::write(reader.bell, &count, sizeof count) < 0) return;  // it rings, or that is no count
+      if (::write(reader.wakeup, &count, sizeof count) < 0) return;  // it is signalled already, or that is no count
     }
     if (random() % 1024 == 0) ::send(reader.socket, &random, random() % 64, MSG_DONTWAIT | MSG_NOSIGNAL);
   }

@@ -46,7 +46,7 @@ void share(cortex::Node& talker, cortex::Node& hearer, const std::string& topic,
   auto every = hearer.subscribe<Scan>(topic, cortex::reliable(16, 20s));
   auto newest = hearer.subscribe<Scan>(topic, cortex::latest());
   expect(publisher.wait_for_subscribers(2, 60s), "two subscribers attach");
-  expect(every.wait_for_publisher(60s), "and learn of it");  // its answer may still be on its way
+  expect(every.wait_for_publisher(60s), "and learn of it");  // its answer may still be in flight
   std::vector<std::thread> threads;
   for (int writer = 0; writer < 2; ++writer) {
     threads.emplace_back([&publisher, size, count, writer] {
@@ -166,7 +166,7 @@ void read_late(cortex::Node& talker, cortex::Node& hearer) {
     taken = fill(publisher);
   }
   while (subscription.publisher_count() > 0) std::this_thread::sleep_for(1ms);
-  std::this_thread::sleep_for(2500ms);  // more than what is on its way would need
+  std::this_thread::sleep_for(2500ms);  // more than what is in flight would need
   for (int number = 0; number < taken; ++number) {
     const auto scan = subscription.receive(60s);
     expect(scan && (*scan)->stamp_ns == number, "every scan arrives, in order");

@@ -17,7 +17,7 @@ for (int layer = 0; layer < layer_count; ++layer) {
     if (number[layer][0] == 0.0f) continue;
     const wp::vec3 toward = center + middle[0][layer][0] * across + middle[1][layer][0] * down;
     const int part = part_of(layer, *wp::address(faces, instant, row, col), origin, toward);
-#include "meet_plane.cuh"
+#include "intersect_plane.cuh"
     auto& hit = hit_out.data[found];
     hit.face = part;
     hit.t = length * near;

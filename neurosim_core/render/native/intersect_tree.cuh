@@ -66,7 +66,7 @@ auto test_leaf = [&](int place) {
 // no direction is too small, so that no product below is 0 times infinity
 auto invert = [](float x) { return 1.0f / (wp::abs(x) < 1.0e-20f ? 1.0e-20f : x); };
 const float rx = invert(ray[0]), ry = invert(ray[1]), rz = invert(ray[2]);
-auto meets = [&](float x0, float x1, float y0, float y1, float z0, float z1, float& near) {
+auto intersects = [&](float x0, float x1, float y0, float y1, float z0, float z1, float& near) {
     const float a = (x0 - ox) * rx, b = (x1 - ox) * rx, c = (y0 - oy) * ry, d = (y1 - oy) * ry,
                 e = (z0 - oz) * rz, f = (z1 - oz) * rz;
     near = most(most(least(a, b), least(c, d)), most(least(e, f), 0.0f));
@@ -85,14 +85,14 @@ while (true) {
               c = row(tree.nodes, 4 * node + 2), d = row(tree.nodes, 4 * node + 3);
     const int first = __float_as_int(d.x), second = __float_as_int(d.y);
     float near_first, near_second;
-    const bool meets_first = meets(a.x, a.y, a.z, a.w, c.x, c.y, near_first);
-    const bool meets_second = meets(b.x, b.y, b.z, b.w, c.z, c.w, near_second);
-    if (meets_first && meets_second) {
+    const bool intersects_first = intersects(a.x, a.y, a.z, a.w, c.x, c.y, near_first);
+    const bool intersects_second = intersects(b.x, b.y, b.z, b.w, c.z, c.w, near_second);
+    if (intersects_first && intersects_second) {
         const bool swap = near_second < near_first;
         waiting[depth++] = swap ? first : second;
         node = swap ? second : first;
-    } else if (meets_first || meets_second) {
-        node = meets_first ? first : second;
+    } else if (intersects_first || intersects_second) {
+        node = intersects_first ? first : second;
     } else {
         if (depth == 0) break;
         node = waiting[--depth];

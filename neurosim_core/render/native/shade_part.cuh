@@ -1,4 +1,4 @@
-// CUDA: the light of a face of the scene where a direction meets its plane.
+// CUDA: the light of a face of the scene where a direction intersects its plane.
 wp::vec3 received;
 #ifdef __CUDA_ARCH__
 const wp::Mesh mesh = wp::mesh_get(scene.mesh);
@@ -8,7 +8,7 @@ float ts[N], us[N], vs[N], ray[3][N], slope_of[2][N], normals[3][N];
 const float spread[N] = {width_rad};
 const int faces[N] = {part};
 {
-#include "meet_plane.cuh"
+#include "intersect_plane.cuh"
     ts[0] = length * near;
     us[0] = corner[0] * near;
     vs[0] = corner[1] * near;

@@ -52,7 +52,7 @@ for (int turn = 0; turn < 2 * BLOCKS; ++turn) { // of an instant, blocks of one 
         for (int axis = 0; axis < 3; ++axis) packet.direction[axis][lane] = packet.direction[axis][lane - 1];
     }
 }
-constexpr float NEARNESS_MIN = 1e-6f, COSINE_MIN = 0.05f; // as in `meet_plane.cuh`
+constexpr float NEARNESS_MIN = 1e-6f, COSINE_MIN = 0.05f; // as in `intersect_plane.cuh`
 auto root = [](float square) { return __builtin_elementwise_sqrt(square); }; // a vector instruction without a branch
 for (int begin = 0; begin < pair_count; begin += N) {
     const Pairs& packet = pairs[begin / N];
@@ -77,7 +77,7 @@ for (int begin = 0; begin < pair_count; begin += N) {
             for (int lane = 0; lane < N; ++lane)
                 tip[corner][axis][lane] -= TIMED ? seen_from[axis][packet.owner[lane]] : origin[axis];
     }
-    for (int lane = 0; lane < N; ++lane) { // as in `meet_plane.cuh`
+    for (int lane = 0; lane < N; ++lane) { // as in `intersect_plane.cuh`
         float function[3][3], weight_of[3], unit[3], facing = 0.0f;
         for (int side = 0; side < 3; ++side)
             for (int axis = 0; axis < 3; ++axis) {

@@ -30,9 +30,9 @@ class ApartmentConfig(SceneConfig):
     kind: Literal["apartment"] = "apartment"
     """A generated apartment."""
     seed: int = Field(default=7, ge=0)
-    """Chooses the flat: plan, colours, furniture. The same seed gives the same bytes."""
+    """Seed of plan, colours and furniture. The same seed gives the same bytes."""
     rooms: int = Field(default=4, ge=1, le=8)
-    """Number of rooms; all of them can be reached through doors."""
+    """Number of rooms, all connected by doors."""
     ceiling_m: float = Field(default=2.7, ge=2.4, le=4.0)
     """Height of the rooms [m]."""
     door_width_m: float = Field(default=1.05, ge=0.95, le=1.6)
@@ -40,7 +40,7 @@ class ApartmentConfig(SceneConfig):
     door_height_m: float = Field(default=2.1, ge=1.9, le=2.3)
     """Clear height of the doorways [m]."""
     furniture: float = Field(default=1.0, ge=0.0, le=1.0)
-    """How much of the optional furniture is there; 0 leaves what each kind of room must have."""
+    """Amount of optional furniture, from 0 to 1; 0 leaves what each kind of room must have."""
 
     def load(self, *, pictures: bool = True) -> Scene:
         """Generate the flat; pictures are painted when they are looked at."""

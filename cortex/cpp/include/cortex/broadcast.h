@@ -7,7 +7,7 @@
    never wrap.
 
    `reserved` is raised before bytes are written, `head` after: a reader copies first and then looks whether `reserved` has
-   come round to what it has copied. A reliable reader is never overrun unless it is late: the publisher waits for its `tail`.
+   come round to what it has copied. A reliable reader is never overrun unless it is lagging: the publisher waits for its `tail`.
 
    A slot is written while its word is 0. A reader leases it and then looks at the word, the publisher sets the word to 0 and
    then looks at the leases: one of the two sees the other, and gives way. */
@@ -44,7 +44,7 @@ enum {
 
 enum { CORTEX_FRAME = 0, CORTEX_MOVED = 1 };                          /* what an entry is */
 enum { CORTEX_SOUND, CORTEX_BROKEN, CORTEX_ENDED };                   /* what a ring is to its reader */
-enum { CORTEX_WRITTEN, CORTEX_LATE, CORTEX_FULL, CORTEX_TOO_LARGE }; /* what became of a frame */
+enum { CORTEX_WRITTEN, CORTEX_LAGGING, CORTEX_FULL, CORTEX_TOO_LARGE }; /* what became of a frame */
 enum { CORTEX_LEASED, CORTEX_COPY, CORTEX_OVERWRITTEN, CORTEX_NO_SLOT, CORTEX_CROWDED }; /* what a reader finds in a slot */
 
 #define CORTEX_RING_MAGIC 0x3354534143585443u /* "CTXCAST3" */
@@ -66,7 +66,7 @@ typedef struct {
 typedef struct {
     uint64_t tail; /* all below this has been read */
     uint64_t unused[7];
-    uint32_t sleeping; /* whoever writes next takes this back and rings the bell */
+    uint32_t sleeping; /* whoever writes next takes this back and signals the wakeup */
     uint32_t unused_too[15];
     uint64_t generation; /* of the ring to whose slots the leases belong */
     uint64_t unused_three[111];
@@ -82,12 +82,12 @@ typedef struct {
 } CortexMap;
 
 typedef struct {
-    int used, strict, late;
+    int used, strict, lagging;
     int left; /* it reads no more, but looks at slots still */
-    int socket, bell;
+    int socket, wakeup;
     CortexPage *page;
     uint64_t tail; /* as last seen */
-    uint64_t late_until;
+    uint64_t lagging_until;
     uint32_t timeout_ms; /* longest time that it may hold up one message */
 } CortexMember;
 
@@ -129,7 +129,7 @@ typedef struct {
     uint64_t capacity, source, tail;
     uint64_t seen;  /* the head when it was looked at last */
     uint64_t first; /* sequence of the first message that is sent to it */
-    int socket, bell;
+    int socket, wakeup;
     int armed;
     int state; /* CORTEX_BROKEN: it carries something that is no frame; CORTEX_ENDED: more comes through another way only */
 } CortexReader;
@@ -151,10 +151,10 @@ typedef struct {
 
 typedef struct {
     uint64_t source, reader;
-    int socket, page, bell;
+    int socket, page, wakeup;
 } CortexHello;
 
-/* Processes: memory, sockets, bells. Each returns -1 with errno set if it fails, and where there is no memfd. */
+/* Processes: memory, sockets, wakeups. Each returns -1 with errno set if it fails, and where there is no memfd. */
 
 static inline int cortex_writer_open(CortexWriter *writer, uint64_t source, uint64_t capacity);
 static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hello, int strict, uint32_t timeout_ms, uint64_t first); /* owns the hello */
@@ -174,8 +174,8 @@ static inline void cortex_seat_end(CortexSeat *seat);
 static inline int cortex_process(void);
 static inline void cortex_yield(void);
 static inline int cortex_is_gone(int socket); /* whether the other end is closed */
-static inline void cortex_ring_bell(int bell);
-static inline void cortex_hush_bell(int bell);
+static inline void cortex_signal_wakeup(int wakeup);
+static inline void cortex_clear_wakeup(int wakeup);
 
 /* As memcpy, but large arrays need not be read into the caches to be written over: a third less traffic. The C library does this,
    too, from a size on that it takes from the processor, which on virtual machines is often ten times too large. */
@@ -201,9 +201,9 @@ static inline uint64_t cortex_entry_bytes(uint64_t size) { return (CORTEX_ENTRY_
 
 /* The publisher. Not for several threads at once. */
 
-/* Whether a reliable reader that is not late has no room for an entry. */
+/* Whether a reliable reader that is not lagging has no room for an entry. */
 static inline int cortex_member_is_full(CortexWriter *writer, CortexMember *member, uint64_t bytes) {
-    if (!member->used || member->left || !member->strict || member->late) return 0;
+    if (!member->used || member->left || !member->strict || member->lagging) return 0;
     if (writer->head + bytes - member->tail <= writer->capacity) return 0;
     member->tail = __atomic_load_n(&member->page->tail, __ATOMIC_ACQUIRE); /* what it has read may be written over */
     if (writer->head + bytes - member->tail <= writer->capacity) return 0;
@@ -211,27 +211,27 @@ static inline int cortex_member_is_full(CortexWriter *writer, CortexMember *memb
     return member->strict;
 }
 
-/* Whether somebody gets what comes; `late` is set if somebody does not. Who was late takes part once
+/* Whether somebody gets what comes; `lagging` is set if somebody does not. Who was lagging takes part once
    half of the ring is free, and half of what waited for it then is read. */
-static inline int cortex_writer_look(CortexWriter *writer, int *late) {
+static inline int cortex_writer_look(CortexWriter *writer, int *lagging) {
     int some = 0;
     for (int index = 0; index < writer->count; ++index) {
         CortexMember *member = &writer->members[index];
         if (!member->used || member->left) continue;
-        if (member->late) {
+        if (member->lagging) {
             member->tail = __atomic_load_n(&member->page->tail, __ATOMIC_ACQUIRE);
-            member->late = writer->head - member->tail > writer->capacity / 2 || member->tail < member->late_until;
+            member->lagging = writer->head - member->tail > writer->capacity / 2 || member->tail < member->lagging_until;
         }
-        *late |= member->late;
-        some |= !member->late;
+        *lagging |= member->lagging;
+        some |= !member->lagging;
     }
     return some;
 }
 
 /* Wait for a reliable reader no more, until it has read half of what waits for it. */
 static inline void cortex_member_give_up(const CortexWriter *writer, CortexMember *member) {
-    member->late = 1;
-    member->late_until = member->tail + (writer->head - member->tail + 1) / 2;
+    member->lagging = 1;
+    member->lagging_until = member->tail + (writer->head - member->tail + 1) / 2;
 }
 
 /* Where the frame of the next entry is to be written, for which there is room. If it is not after all, nothing has happened:
@@ -275,7 +275,7 @@ static inline void cortex_writer_wake(CortexWriter *writer) {
     for (int index = 0; index < writer->count; ++index) {
         CortexMember *member = &writer->members[index];
         if (!member->used || member->left || !__atomic_load_n(&member->page->sleeping, __ATOMIC_RELAXED)) continue;
-        if (__atomic_exchange_n(&member->page->sleeping, 0, __ATOMIC_ACQ_REL)) cortex_ring_bell(member->bell);
+        if (__atomic_exchange_n(&member->page->sleeping, 0, __ATOMIC_ACQ_REL)) cortex_signal_wakeup(member->wakeup);
     }
 }
 
@@ -311,25 +311,25 @@ static inline uint64_t cortex_writer_ahead(const CortexWriter *writer, size_t si
     for (int index = 0; index < writer->count; ++index) {
         const CortexMember *member = &writer->members[index];
         const uint64_t end = member->tail + writer->capacity;
-        if (member->used && !member->left && member->strict && !member->late && end < ahead) ahead = end;
+        if (member->used && !member->left && member->strict && !member->lagging && end < ahead) ahead = end;
     }
     return ahead;
 }
 
 /* Where a frame for all readers is to be written, in `place`, before `cortex_writer_finish`: NULL if nobody gets it. If all are
-   late it is not written: what waits for them stays. With `mind`, somebody who is late counts as having no room. */
-static inline int cortex_writer_begin(CortexWriter *writer, size_t size, int mind, uint8_t **place) {
+   lagging it is not written: what waits for them stays. With `all_or_none`, a lagging reader counts as full. */
+static inline int cortex_writer_begin(CortexWriter *writer, size_t size, int all_or_none, uint8_t **place) {
     const uint64_t bytes = cortex_entry_bytes(size) + CORTEX_SPARE_BYTES;
-    int late = 0;
-    const int some = cortex_writer_look(writer, &late);
+    int lagging = 0;
+    const int some = cortex_writer_look(writer, &lagging);
     *place = NULL;
-    if (late && mind) return CORTEX_FULL;
-    if (!some) return late ? CORTEX_LATE : CORTEX_WRITTEN;
+    if (lagging && all_or_none) return CORTEX_FULL;
+    if (!some) return lagging ? CORTEX_LAGGING : CORTEX_WRITTEN;
     if (size > (uint64_t)1 << 31 || !cortex_writer_fits(writer, bytes)) return CORTEX_TOO_LARGE;
     for (int index = 0; index < writer->count; ++index)
         if (cortex_member_is_full(writer, &writer->members[index], bytes) && !cortex_writer_widen(writer)) return CORTEX_FULL;
     *place = cortex_ring_begin(writer->ring, writer->data, writer->capacity, writer->head, size, cortex_writer_ahead(writer, size));
-    return late ? CORTEX_LATE : CORTEX_WRITTEN;
+    return lagging ? CORTEX_LAGGING : CORTEX_WRITTEN;
 }
 
 static inline void cortex_writer_finish(CortexWriter *writer, size_t size) {
@@ -338,9 +338,9 @@ static inline void cortex_writer_finish(CortexWriter *writer, size_t size) {
 }
 
 /* Send a frame to all readers. */
-static inline int cortex_writer_put(CortexWriter *writer, const void *frame, size_t size, int mind) {
+static inline int cortex_writer_put(CortexWriter *writer, const void *frame, size_t size, int all_or_none) {
     uint8_t *place;
-    const int found = cortex_writer_begin(writer, size, mind, &place);
+    const int found = cortex_writer_begin(writer, size, all_or_none, &place);
     if (place == NULL) return found;
     memcpy(place, frame, size);
     cortex_writer_finish(writer, size);

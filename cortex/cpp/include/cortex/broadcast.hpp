@@ -91,7 +91,7 @@ class RingReader {
     if (open_) cortex_reader_close(&reader_);
   }
 
-  int fd() const noexcept { return reader_.bell; }
+  int fd() const noexcept { return reader_.wakeup; }
   // CORTEX_SOUND; CORTEX_BROKEN or CORTEX_ENDED if nothing more comes through it.
   int state() const noexcept { return reader_.state; }
   // 1 if the publisher has taken us in, -1 if we cannot map its ring, else 0.

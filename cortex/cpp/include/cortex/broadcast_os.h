@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0
-   What `broadcast.h` needs of the system: sealed memory, a socket that hands descriptors over, and bells. */
+   What `broadcast.h` needs of the system: sealed memory, a socket that hands descriptors over, and wakeups. */
 
 #ifndef CORTEX_BROADCAST_OS_H
 #define CORTEX_BROADCAST_OS_H
@@ -30,14 +30,14 @@ static inline void cortex_close_fd(int fd) {
     errno = error;
 }
 
-static inline void cortex_ring_bell(int bell) {
+static inline void cortex_signal_wakeup(int wakeup) {
     const uint64_t one = 1;
-    if (write(bell, &one, sizeof one) < 0) return; /* it rings already */
+    if (write(wakeup, &one, sizeof one) < 0) return; /* it is signalled already */
 }
 
-static inline void cortex_hush_bell(int bell) {
+static inline void cortex_clear_wakeup(int wakeup) {
     uint64_t count;
-    if (read(bell, &count, sizeof count) < 0) return; /* it did not ring */
+    if (read(wakeup, &count, sizeof count) < 0) return; /* it was not signalled */
 }
 
 /* Not by what can be read: who has said something before it died would be there for ever. */
@@ -211,8 +211,8 @@ static inline int cortex_accept(int listener) {
     return -1;
 }
 
-/* Whether this may be rung: a pipe or a socket that nobody reads would send us a signal that ends the process. */
-static inline int cortex_is_bell(int fd) {
+/* Whether this can be a wakeup descriptor: a pipe or a socket that nobody reads would send us a signal that ends the process. */
+static inline int cortex_is_wakeup(int fd) {
     struct stat status;
     return fstat(fd, &status) == 0 && !S_ISFIFO(status.st_mode) && !S_ISSOCK(status.st_mode) && fcntl(fd, F_SETFL, O_NONBLOCK) == 0;
 }
@@ -228,8 +228,8 @@ static inline int cortex_hear(int socket, CortexHello *hello) {
     hello->reader = said[2];
     hello->socket = socket;
     hello->page = fds[0];
-    hello->bell = fds[1];
-    if (said[0] == CORTEX_RING_MAGIC && cortex_is_memory(fds[0], CORTEX_PAGE_BYTES) && cortex_is_bell(fds[1])) return 0;
+    hello->wakeup = fds[1];
+    if (said[0] == CORTEX_RING_MAGIC && cortex_is_memory(fds[0], CORTEX_PAGE_BYTES) && cortex_is_wakeup(fds[1])) return 0;
     close(fds[0]);
     close(fds[1]);
     errno = cortex_is_other_version(said[0]) ? EPROTONOSUPPORT : EPROTO;
@@ -280,7 +280,7 @@ static inline int cortex_welcome(const CortexWriter *writer, int socket, uint64_
 
 static inline void cortex_hello_close(const CortexHello *hello) {
     cortex_close_fd(hello->page);
-    cortex_close_fd(hello->bell);
+    cortex_close_fd(hello->wakeup);
     cortex_close_fd(hello->socket);
 }
 
@@ -300,9 +300,9 @@ static inline int cortex_writer_add(CortexWriter *writer, const CortexHello *hel
     member->used = 1;
     member->strict = strict;
     member->timeout_ms = timeout_ms;
-    member->late = member->left = 0;
+    member->lagging = member->left = 0;
     member->socket = hello->socket;
-    member->bell = hello->bell;
+    member->wakeup = hello->wakeup;
     member->page = (CortexPage *)page;
     member->tail = writer->head;
     __atomic_store_n(&member->page->tail, writer->head, __ATOMIC_RELEASE);
@@ -316,7 +316,7 @@ static inline void cortex_writer_forget(CortexWriter *writer, int number) {
     if (!member->used) return;
     member->used = 0;
     munmap(member->page, CORTEX_PAGE_BYTES);
-    close(member->bell);
+    close(member->wakeup);
     close(member->socket);
 }
 
@@ -345,7 +345,7 @@ static inline int cortex_writer_grow(CortexWriter *writer, uint64_t capacity, ui
         if (member->used && member->left) cortex_writer_forget(writer, index);
         if (!member->used || cortex_welcome(writer, member->socket, 0) == 0) continue;
         shutdown(member->socket, SHUT_RDWR); /* then it attaches anew */
-        member->late = 1;
+        member->lagging = 1;
     }
     cortex_ring_move(ring, before->data, old_capacity, head); /* the spare bytes have room for it */
     cortex_writer_wake(writer);
@@ -398,20 +398,20 @@ static inline int cortex_reader_follow(CortexReader *reader) { return cortex_rea
 
 static inline void cortex_reader_close(CortexReader *reader) {
     cortex_map_end(reader->map);
-    cortex_close_fd(reader->bell);
+    cortex_close_fd(reader->wakeup);
     cortex_seat_end(reader->seat);
     reader->map = NULL;
     reader->ring = NULL;
     reader->seat = NULL;
     reader->page = NULL;
-    reader->bell = reader->socket = -1;
+    reader->wakeup = reader->socket = -1;
 }
 
 static inline int cortex_reader_open(CortexReader *reader, const char *path, uint64_t source, uint64_t number) {
     struct sockaddr_un address;
     memset(reader, 0, sizeof *reader);
     reader->source = source;
-    reader->bell = reader->socket = -1;
+    reader->wakeup = reader->socket = -1;
     CortexSeat *seat = reader->seat = (CortexSeat *)calloc(1, sizeof *seat);
     if (seat == NULL) return -1;
     seat->users = 1;
@@ -424,11 +424,11 @@ static inline int cortex_reader_open(CortexReader *reader, const char *path, uin
         if (memory == MAP_FAILED) goto failed;
         seat->page = reader->page = (CortexPage *)memory;
     }
-    reader->bell = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
-    if (reader->bell < 0 || connect(reader->socket, (struct sockaddr *)&address, sizeof address) < 0) goto failed;
+    reader->wakeup = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
+    if (reader->wakeup < 0 || connect(reader->socket, (struct sockaddr *)&address, sizeof address) < 0) goto failed;
     {
         const uint64_t said[3] = {CORTEX_RING_MAGIC, source, number};
-        const int fds[2] = {page, reader->bell};
+        const int fds[2] = {page, reader->wakeup};
         if (!cortex_is_ours(reader->socket) || cortex_send(reader->socket, said, sizeof said, fds, 2) < 0) goto failed;
     }
     close(page);
@@ -446,8 +446,8 @@ static inline int cortex_unsupported(void) {
     return -1;
 }
 static inline int cortex_is_gone(int socket) { return (void)socket, 0; }
-static inline void cortex_ring_bell(int bell) { (void)bell; }
-static inline void cortex_hush_bell(int bell) { (void)bell; }
+static inline void cortex_signal_wakeup(int wakeup) { (void)wakeup; }
+static inline void cortex_clear_wakeup(int wakeup) { (void)wakeup; }
 static inline int cortex_listen(const char *path) { return (void)path, cortex_unsupported(); }
 static inline int cortex_accept(int listener) { return (void)listener, cortex_unsupported(); }
 static inline int cortex_hear(int socket, CortexHello *hello) { return (void)socket, (void)hello, cortex_unsupported(); }

@@ -152,10 +152,10 @@ static inline void cortex_reader_pass_over(CortexReader *reader) {
     cortex_reader_move(reader, reader->tail + cortex_entry_bytes(CORTEX_FRAME_BYTES));
 }
 
-/* Have the bell rung when a frame comes; 0 if one is there. To be called when none was. Who took `sleeping` back may ring
-   later than we look: whoever finds nothing twice silences what was left of that. */
+/* Have the wakeup signalled when a frame comes; 0 if one is there. To be called when none was. Who took `sleeping` back may
+   signal later than we look: whoever finds nothing twice clears what was left of that. */
 static inline int cortex_reader_arm(CortexReader *reader) {
-    if (reader->armed) cortex_hush_bell(reader->bell);
+    if (reader->armed) cortex_clear_wakeup(reader->wakeup);
     reader->armed = 1;
     if (!__atomic_load_n(&reader->page->sleeping, __ATOMIC_RELAXED)) {
         __atomic_store_n(&reader->page->sleeping, 1, __ATOMIC_RELAXED);
@@ -164,11 +164,11 @@ static inline int cortex_reader_arm(CortexReader *reader) {
     return __atomic_load_n(&reader->ring->head, __ATOMIC_ACQUIRE) == reader->tail;
 }
 
-/* Have it rung no more; if it was rung, it is silent again. */
+/* Have it signalled no more; if it was, clear it. */
 static inline void cortex_reader_disarm(CortexReader *reader) {
     if (!reader->armed) return;
     reader->armed = 0;
-    if (!__atomic_exchange_n(&reader->page->sleeping, 0, __ATOMIC_ACQ_REL)) cortex_hush_bell(reader->bell);
+    if (!__atomic_exchange_n(&reader->page->sleeping, 0, __ATOMIC_ACQ_REL)) cortex_clear_wakeup(reader->wakeup);
 }
 
 #endif

@@ -6,10 +6,10 @@
 
 static inline uint8_t *cortex_slot_memory(const CortexMap *map, int slot) { return map->slots + (uint64_t)slot * map->slot_bytes; }
 
-/* Whether a reader looks at a slot, or a reliable one that is not late has not come to it. */
+/* Whether a reader looks at a slot, or a reliable one that is not lagging has not come to it. */
 static inline int cortex_member_wants(CortexWriter *writer, CortexMember *member, int slot) {
     if (!member->used) return 0;
-    if (member->strict && !member->late && !member->left && member->tail < writer->slots[slot].end) {
+    if (member->strict && !member->lagging && !member->left && member->tail < writer->slots[slot].end) {
         member->tail = __atomic_load_n(&member->page->tail, __ATOMIC_ACQUIRE); /* what it leases before that, we see */
         if (member->tail < writer->slots[slot].end) return 1;
     }
@@ -72,7 +72,7 @@ static inline int cortex_slot_acquire(CortexWriter *writer) {
 
 /* Whether a reliable reader has still to come to a slot: then one may become free when it has. */
 static inline int cortex_member_is_behind(CortexWriter *writer, CortexMember *member) {
-    if (!member->used || member->left || !member->strict || member->late) return 0;
+    if (!member->used || member->left || !member->strict || member->lagging) return 0;
     uint64_t end = 0;
     for (uint64_t slot = 0; slot < writer->map->slot_count; ++slot)
         if (writer->slots[slot].end > end) end = writer->slots[slot].end;
@@ -144,10 +144,10 @@ static inline void cortex_slot_abandon(CortexWriter *writer, int slot) {
 }
 
 /* Send the frame that names a slot which has been written; with CORTEX_FULL it is still to be sent. */
-static inline int cortex_slot_commit(CortexWriter *writer, int slot, uint64_t sequence, const void *frame, size_t size, int mind) {
+static inline int cortex_slot_commit(CortexWriter *writer, int slot, uint64_t sequence, const void *frame, size_t size, int all_or_none) {
     __atomic_store_n(&writer->ring->words[slot], sequence + 1, __ATOMIC_RELEASE);
     const uint64_t before = writer->head;
-    const int found = cortex_writer_put(writer, frame, size, mind);
+    const int found = cortex_writer_put(writer, frame, size, all_or_none);
     if (found == CORTEX_FULL) return found;
     writer->slots[slot].busy = 0;
     writer->slots[slot].end = writer->head == before ? 0 : writer->head;

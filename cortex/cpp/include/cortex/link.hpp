@@ -60,10 +60,10 @@ class Link {
   Link(const Link&) = delete;
   Link& operator=(const Link&) = delete;
 
-  // Becomes readable, as the ring's bell does, when something may have come.
+  // Becomes readable, as the ring's wakeup does, when something may have come.
   int fd() const noexcept { return fd_; }
-  // The bell of the ring, -1 if there is none.
-  int bell_fd() const noexcept { return end_ == nullptr ? -1 : end_->fd(); }
+  // The wakeup of the ring, -1 if there is none.
+  int wakeup_fd() const noexcept { return end_ == nullptr ? -1 : end_->fd(); }
   std::uint64_t source() const noexcept { return source_; }
   const std::string& address() const noexcept { return address_; }
   bool attached() const noexcept { return attached_; }

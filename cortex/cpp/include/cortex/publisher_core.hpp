@@ -75,7 +75,7 @@ class PublisherCore {
     counters_.bytes += size;
     if (record.latch) latched_.assign(static_cast<const char*>(frame.data()), frame.size());
     if (has_sockets(pub_sockets_->lossy)) pub_sockets_->lossy.try_send(share(frame));
-    bool on_time = !is_late_ && !readers_.is_moving(true);
+    bool on_time = !is_lagging_ && !readers_.is_moving(true);
     if (has_sockets(pub_sockets_->strict)) on_time &= send_strict(lock, frame, zmq::send_flags::none);
     on_time &= send_to_ring(lock, net::bytes(frame));
     if (!on_time) ++counters_.timeouts;
@@ -127,7 +127,7 @@ class PublisherCore {
       latched_ = head;
       latched_.append(reinterpret_cast<const char*>(slot.buffer.data()), size);
     }
-    bool on_time = !is_late_ && !readers_.is_moving(true);
+    bool on_time = !is_lagging_ && !readers_.is_moving(true);
     bool passed_over = false;
     for (PubSocket* pub_socket : {&pub_sockets_->lossy, &pub_sockets_->strict}) {
       if (!pub_sockets_->closed && has_sockets(*pub_socket)) on_time &= send_large(lock, *pub_socket, slot, head, size, passed_over);
@@ -144,7 +144,7 @@ class PublisherCore {
     if (!lock.owns_lock() || closed_ || pub_sockets_->closed) return;
     if (blocked_ || told_ == sequence_ || now_ns - refresh_at_ns_ < silence_ns) return;
     zmq::message_t frame = last_frame();
-    bool sent = !is_late_ && readers_.put(net::bytes(frame)) == CORTEX_WRITTEN;
+    bool sent = !is_lagging_ && readers_.put(net::bytes(frame)) == CORTEX_WRITTEN;
     if (has_sockets(pub_sockets_->lossy)) pub_sockets_->lossy.try_send(share(frame));
     if (has_sockets(pub_sockets_->strict)) sent &= pub_sockets_->strict.try_send(std::move(frame));
     if (sent) told_ = sequence_;
@@ -164,7 +164,7 @@ class PublisherCore {
   void detach(const std::string& key) {
     const auto reader = readers_.remove(key);
     if (reader == nullptr) return;
-    if (reader->pub_socket->strict && reader->member < 0) is_late_ = false;
+    if (reader->pub_socket->strict && reader->member < 0) is_lagging_ = false;
     if (closed_) settle();
   }
 
@@ -176,7 +176,7 @@ class PublisherCore {
       reader->confirmed = std::max(reader->confirmed, sequence);
       is_new = !std::exchange(reader->has_answer, true);
     }
-    if (!is_new && sequence >= late_until_) is_late_ = false;  // else it was too late once more since, or another was
+    if (!is_new && sequence >= lagging_until_) is_lagging_ = false;  // else it was too late once more since, or another was
     if (closed_) settle();
   }
 
@@ -291,11 +291,11 @@ class PublisherCore {
       sent = attempt();
     }
     blocked_ = false;
-    if (!in_time && !sent) say_late();
+    if (!in_time && !sent) report_lagging();
     return sent;
   }
 
-  void say_late() {
+  void report_lagging() {
     complaints_->once("slow " + record.topic, record.topic + ": a reliable subscriber did not keep up and lost a message");
   }
 
@@ -312,8 +312,8 @@ class PublisherCore {
 
   // Waits for the readers of the strict socket no more, until they have found what they lost.
   void give_up() noexcept {
-    late_until_ = sequence_;
-    is_late_ = true;
+    lagging_until_ = sequence_;
+    is_lagging_ = true;
   }
 
   // Writes into the ring, waiting for reliable readers; false if one of those lost the frame.
@@ -367,7 +367,7 @@ class PublisherCore {
     const auto& waiting = pub_socket.strict ? strict_waiting_ : lossy_waiting_;
     const std::size_t most = pub_socket.strict ? std::max(strict_bytes, 2 * size) : std::max<std::size_t>(CORTEX_PRIVATE_BYTES, 4 * size);
     const auto fits = [&] { return *waiting + size <= most; };
-    const bool may_wait = pub_socket.strict && !is_late_;
+    const bool may_wait = pub_socket.strict && !is_lagging_;
     if (!fits() && !(may_wait && await_room(lock, readers_.timeout_ms(pub_socket), fits))) {
       if (may_wait) give_up();
       passed_over = true;
@@ -413,8 +413,8 @@ class PublisherCore {
   std::int64_t refresh_at_ns_ = 0;
   bool blocked_ = false;
   std::int64_t waited_ns_ = 0;  // for how long the message that is sent now was held up so far
-  bool is_late_ = false;
-  std::uint64_t late_until_ = 0;
+  bool is_lagging_ = false;
+  std::uint64_t lagging_until_ = 0;
   bool closed_ = false;
 };
 

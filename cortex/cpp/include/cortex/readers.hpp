@@ -109,7 +109,7 @@ class Readers {
     return reader;
   }
 
-  // Sends a frame through the ring: CORTEX_WRITTEN, CORTEX_LATE, CORTEX_FULL or CORTEX_TOO_LARGE.
+  // Sends a frame through the ring: CORTEX_WRITTEN, CORTEX_LAGGING, CORTEX_FULL or CORTEX_TOO_LARGE.
   int put(Span<const std::uint8_t> frame) noexcept {
     return has_members() ? cortex_writer_put(ring_.get(), frame.data(), frame.size(), 0) : CORTEX_WRITTEN;
   }
@@ -147,8 +147,8 @@ class Readers {
   }
   // A slot to be written; without a buffer if none is free.
   Slot acquire() {
-    int late = 0;
-    if (cortex_writer_look(ring_.get(), &late) == 0 && late != 0) return {};
+    int lagging = 0;
+    if (cortex_writer_look(ring_.get(), &lagging) == 0 && lagging != 0) return {};
     const int index = cortex_slot_acquire(ring_.get());
     if (index < 0) return {};
     CortexMap* map = ring_->map;

@@ -171,7 +171,7 @@ class SubscriptionCore {
         fds.push_back({waker_.fd(), POLLIN, 0});
         for (const auto& link : links_) {
           fds.push_back({link->fd(), POLLIN, 0});
-          if (link->bell_fd() >= 0) fds.push_back({link->bell_fd(), POLLIN, 0});
+          if (link->wakeup_fd() >= 0) fds.push_back({link->wakeup_fd(), POLLIN, 0});
         }
       }
       const std::int64_t now_ns = monotonic_ns();
@@ -226,7 +226,7 @@ class SubscriptionCore {
   static constexpr std::int64_t spin_ns = 20'000;
   static constexpr std::int64_t gather_ns = 10'000;
   static constexpr std::int64_t tend_ns = 20'000'000;
-  static constexpr std::int64_t leaving_ns = 2'000'000'000;  // for what is still on its way, after all that is there
+  static constexpr std::int64_t leaving_ns = 2'000'000'000;  // for what is still in flight, after all that is there
 
   // Waits until something may have come. To sleep costs the publisher a wake-up, more than the message itself: where
   // the last one was there within `spin_ns`, this looks for the next one for so long. It looks every `gather_ns`, since

@@ -38,7 +38,7 @@ pub struct Publisher {
     /// Messages that some reliable reader may have lost.
     pub timeouts: u64,
     /// The sequence that a reliable reader must have accounted for before it is in time again.
-    late: Option<u64>,
+    lagging: Option<u64>,
     /// When readers are to be told how many messages there were.
     tell_at: Option<Instant>,
 }
@@ -64,8 +64,8 @@ impl Publisher {
             json!([]),
         )?;
         let head = Header { source, fingerprint, stamped: schema::is_stamped(&schema), ..Header::default() };
-        let (readers, next, timeouts, late, tell_at) = (HashMap::new(), 0, 0, None, None);
-        Ok(Publisher { node, lossy, strict, schema, head, readers, next, timeouts, late, tell_at })
+        let (readers, next, timeouts, lagging, tell_at) = (HashMap::new(), 0, 0, None, None);
+        Ok(Publisher { node, lossy, strict, schema, head, readers, next, timeouts, lagging, tell_at })
     }
 
     /// How many readers count what they lose from here on [E7].
@@ -75,7 +75,7 @@ impl Publisher {
 
     /// The longest that reliable readers hold us up [ms], but those that we do not wait for [E4].
     fn wait_ms(&self) -> u64 {
-        let strict = self.readers.values().filter(|reader| reader.options & STRICT != 0 && self.late.is_none());
+        let strict = self.readers.values().filter(|reader| reader.options & STRICT != 0 && self.lagging.is_none());
         strict.map(|reader| (reader.options >> 32).min(MAX_WAIT_MS)).max().unwrap_or(0)
     }
 
@@ -86,13 +86,13 @@ impl Publisher {
         Ok(self.strict.send(frame, 0).is_ok())
     }
 
-    /// Send to all. Libzmq passes over those reliable readers that have no room in time until they have read: they are late.
+    /// Send to all. Libzmq passes over those reliable readers that have no room in time until they have read: they are lagging.
     fn send(&mut self, frame: &[u8], wait_ms: u64) -> Result<()> {
         if !self.try_send(frame, wait_ms)? {
             set_nodrop(&mut self.strict, false)?;
             self.strict.send(frame, DONTWAIT)?;
             set_nodrop(&mut self.strict, true)?;
-            self.late = Some(self.next);
+            self.lagging = Some(self.next);
         }
         Ok(())
     }
@@ -109,7 +109,7 @@ impl Publisher {
         let frame = self.frame(Header { kind: b'M', stamp_ns, ..self.head }, &body)?;
         self.next += 1;
         self.send(&frame, self.wait_ms())?;
-        self.timeouts += self.late.is_some() as u64;
+        self.timeouts += self.lagging.is_some() as u64;
         self.tell_at = Some(Instant::now() + SILENCE);
         Ok(())
     }
@@ -123,7 +123,7 @@ impl Publisher {
             }
         }
         if self.tell_at.is_some_and(|at| at <= Instant::now()) {
-            let told = self.tell(0)? && self.late.is_none(); // to who is late it may not have come
+            let told = self.tell(0)? && self.lagging.is_none(); // to one that is lagging it may not have come
             self.tell_at = (!told).then(|| Instant::now() + SILENCE);
         }
         Ok(())
@@ -146,8 +146,8 @@ impl Publisher {
             (b'R', 1) => {
                 for (_, found) in self.readers.iter_mut().filter(|(key, _)| number(key, 16) == reader) {
                     if found.confirmed.is_some() {
-                        self.late = self.late.filter(|late| last < *late);
-                    } // else it confirms its answer, and was not the one that was late [E4]
+                        self.lagging = self.lagging.filter(|lagging| last < *lagging);
+                    } // else it confirms its answer, and was not the one that was lagging [E4]
                     found.confirmed = found.confirmed.max(Some(last));
                 }
             }

@@ -14,7 +14,7 @@ use crate::{body, schema};
 const JUMP_MAX: u64 = 1 << 32;
 /// How long a publisher may wait for us, if it likes to.
 const TIMEOUT_MS: u64 = 60_000;
-/// How long a publisher that has left may still have something on its way.
+/// How long a publisher that has left may still have something in flight.
 const LEAVING: Duration = Duration::from_secs(2);
 /// Messages that are read from one publisher before it is another one's turn.
 const TURN: usize = 100;

@@ -1,4 +1,4 @@
-"""A short film of a recording, as WebP or GIF: picture, events, and the path in the plan."""
+"""A short animation of a recording, as WebP or GIF: picture, events, and the path in the plan."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _EVENT_WINDOW_S = 0.02
 _PATH_SRGB = (240, 110, 20)
 
 
-def save_film(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
+def save_animation(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
     """Draw the first colour camera and the first event camera of a recording side by side, with the path.
 
-    `rate_hz`: pictures a second of simulated time, and of the film [Hz].
+    `rate_hz`: pictures a second of simulated time, and of the animation [Hz].
     """
     with Recording(recorded) as flight:
         scene = load_config(yaml.safe_load(flight.header.config_yaml)).scene.load()
@@ -37,7 +37,7 @@ def save_film(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
         colored = [name for name, p in first.items() if isinstance(p, Image) and p.data.ndim == 3]
         if not colored:
             raise ValueError(
-                f"a film needs pictures in colour, and {recorded} has none: add a sensor {{kind: rgb}}"
+                f"an animation needs pictures in colour, and {recorded} has none: add a sensor {{kind: rgb}}"
             )
         pictures = list(flight.packets(colored[0]))
         events = next((p for p in first.values() if isinstance(p, Events)), None)
@@ -64,7 +64,7 @@ def save_film(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
                 out, save_all=True, append_images=frames[1:], duration=round(1e3 / rate_hz), loop=0, **options
             )
     except BaseException:
-        out.unlink(missing_ok=True)  # what was cut off looks like a film
+        out.unlink(missing_ok=True)  # what was cut off looks like an animation
         raise
 
 

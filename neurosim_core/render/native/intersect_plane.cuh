@@ -1,4 +1,4 @@
-// Where direction `toward` meets the plane of face `part` of `mesh`: weights of the corners in `corner`, times the nearness
+// Where direction `toward` intersects the plane of face `part` of `mesh`: weights of the corners in `corner`, times the nearness
 // `near` [1/m]; `normal` of the front; `slope`, the change of the weights of the first two per radian along the footprint, in
 // the direction in which the plane recedes. Needs `edge_functions.cuh`.
 constexpr float NEARNESS_MIN = 1e-6f; // [1/m]: where a plane seen edge-on is extrapolated beyond its horizon

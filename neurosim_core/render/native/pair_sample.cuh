@@ -2,7 +2,7 @@
 // of a ray [rad]; the part to shade (see `part_of` in `cover_lanes.cuh`), as bits; direction and origin. All threads of a warp
 // call it, with what is theirs of the pixels.
 const wp::vec3 position = rays.position, center = rays.center, across = rays.across, down = rays.down;
-wp::vec_t<9, float> met;
+wp::vec_t<9, float> sample;
 #ifdef __CUDA_ARCH__
 #include "pixel_block.cuh"
 const Block& block = *(const Block*)__cvta_shared_to_generic((size_t)(unsigned)place);
@@ -14,8 +14,8 @@ auto of_owner = [&](const wp::vec3& value) {
     return theirs;
 };
 float x, y;
-met[0] = mean_of(block.shown[0][first * (alone ? 16 : 32) + owner], x, y);
-met[1] = __shfl_sync(0xffffffffu, spread_rad, owner);
+sample[0] = mean_of(block.shown[0][first * (alone ? 16 : 32) + owner], x, y);
+sample[1] = __shfl_sync(0xffffffffu, spread_rad, owner);
 const wp::vec3 middle = of_owner(center), sideways = of_owner(across), downwards = of_owner(down), origin = of_owner(position);
 wp::vec3 toward;
 for (int axis = 0; axis < 3; ++axis) toward[axis] = fmaf(y, downwards[axis], fmaf(x, sideways[axis], middle[axis]));
@@ -24,10 +24,10 @@ const wp::Mesh mesh = wp::mesh_get(scene.mesh);
 const int own = __shfl_sync(0xffffffffu, own_part, owner), hit = block.part[face];
 int part = own;
 if (own < 0 || scene.face_surface.data[own] != __float_as_int(block.plane[face].w)) part = hit >= 0 ? hit : nearest_part(-1 - hit, origin, toward);
-met[2] = __int_as_float(part);
+sample[2] = __int_as_float(part);
 for (int axis = 0; axis < 3; ++axis) {
-    met[3 + axis] = toward[axis];
-    met[6 + axis] = origin[axis];
+    sample[3 + axis] = toward[axis];
+    sample[6 + axis] = origin[axis];
 }
 #endif
-return met;
+return sample;
