@@ -100,6 +100,11 @@ class PacketSchema(NamedTuple):
     """The fields after the header (stamp_ns, sequence, sensor)."""
     doc: str = ""
 
+    @property
+    def has_events(self) -> bool:
+        """Whether packets have all that those of `Events` have."""
+        return {*_structure(schema_of(Events))} <= {*_structure(self)}
+
     def field(self, name: str) -> FieldSchema:
         """Return a field by its name."""
         return next(field for field in self.fields if field.name == name)

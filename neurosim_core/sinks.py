@@ -249,9 +249,9 @@ class EventFileSinkConfig(SinkConfig):
     def create(self, name: str, sensors: Mapping[str, SensorConfig], file: Path) -> tuple[str, EventWriter]:
         """Return the name of the camera and the writer of its events; arguments and errors as for `check`."""
         from neurosim_core.io import create_events
-        from neurosim_core.sensors.event_camera import EventSensorConfig
+        from neurosim_core.record.header import describe_sensors
 
-        cameras = {key: each.lens for key, each in sensors.items() if isinstance(each, EventSensorConfig)}
+        cameras = {s.name: s.intrinsics for s in describe_sensors(sensors) if s.has_events and s.intrinsics}
         camera = self.sensor or next(iter(cameras), "")
         if camera not in cameras:
             if not cameras:

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from neurosim_core.data.batch import FIELDS, Sample
 from neurosim_core.data.windows import AT_STAMP, WindowConfig, choose_sensors, field_of, no_ground_truth
-from neurosim_core.packets import NO_EVENTS, EventArrays, PacketSchema
-from neurosim_core.record.chunks import read_rows
+from neurosim_core.packets import EventArrays, PacketSchema
 from neurosim_core.record.hdf5 import FORMAT, import_h5py
-from neurosim_core.record.streams import DSEC_NAMES
+from neurosim_core.record.recording import read_milliseconds
 
 _BATCH_WINDOWS_MAX = 64
 
@@ -109,16 +108,8 @@ class RecordedFlight:
     def _read_events(
         self, group: Any, starts_us: NDArray[np.int64], ends_us: NDArray[np.int64]
     ) -> list[EventArrays]:
-        index, total = group["ms_to_idx"], int(self._camera["event_end"][-1])
-
-        def first_at(millisecond: int) -> int:
-            return min(int(index[millisecond]), total) if millisecond < len(index) else total
-
-        low, high = first_at(int(starts_us.min()) // 1000), first_at(int(ends_us.max()) // 1000 + 1)
-        if low >= high:
-            return [NO_EVENTS] * len(starts_us)
-        names = (DSEC_NAMES[name] for name in EventArrays._fields)
-        events = EventArrays(*(read_rows(group[name], low, high) for name in names))
+        span_us, total = (int(starts_us.min()), int(ends_us.max())), int(self._camera["event_end"][-1])
+        events = read_milliseconds(group, *span_us, event_count=total)
         begin, end = (np.searchsorted(events.t, us, side="right") for us in (starts_us, ends_us))
         return [events.rows(slice(a, b)) for a, b in zip(begin.tolist(), end.tolist(), strict=True)]
 
@@ -126,13 +117,13 @@ class RecordedFlight:
         """Return what is small and needed of a sensor: stamps, and all rows that are not large."""
         count = int(group["packet_count"][()])
         columns = {"stamp_ns": group["stamp_ns"][:count]}
-        kind = PacketSchema.from_json(group.attrs["schema"]).name
-        if kind == "Events":
+        schema = PacketSchema.from_json(group.attrs["schema"])
+        if schema.has_events:
             columns |= {name: group[name][:count] for name in ("dropped_count", "sequence", "event_end")}
-        elif kind == "ImuSample":
+        elif schema.name == "ImuSample":
             force, rate = (group[name][:count] for name in ("specific_force", "angular_rate"))
             columns["rows"] = np.concatenate([columns["stamp_ns"][:, None] * 1e-9, force, rate], axis=1)
-        elif kind == "Odometry":
+        elif schema.name == "Odometry":
             columns["rows"] = np.concatenate([group[n][:count] for n in ("position", "orientation")], axis=1)
         return columns
 
@@ -186,5 +177,4 @@ class RecordedFlight:
 
 
 def _field(group: Any) -> str | None:
-    kind = PacketSchema.from_json(group.attrs["schema"]).name
-    return field_of(kind, str(group.attrs.get("encoding", "")))
+    return field_of(PacketSchema.from_json(group.attrs["schema"]), str(group.attrs.get("encoding", "")))

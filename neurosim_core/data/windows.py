@@ -22,7 +22,9 @@ from neurosim_core.packets import (
     ImuSample,
     Odometry,
     Packet,
+    PacketSchema,
     join_events,
+    schema_of,
 )
 
 _ENCODINGS = {"32FC1": "depth", "32FC2": "flow", "rgb8": "rgb", "mono8": "rgb"}
@@ -79,9 +81,9 @@ class WindowConfig:
         return self.fields is None or name in self.fields
 
 
-def field_of(kind: str, encoding: str) -> str | None:
+def field_of(schema: PacketSchema, encoding: str) -> str | None:
     """Return the field that packets of a class give, whose pictures have an encoding."""
-    named = {"Events": "events", "ImuSample": "imu", "Odometry": "pose"}.get(kind)
+    named = "events" if schema.has_events else {"ImuSample": "imu", "Odometry": "pose"}.get(schema.name)
     return named or _ENCODINGS.get(encoding)
 
 
@@ -120,7 +122,7 @@ class PacketWindows:
 
     def add(self, packet: Packet) -> Iterator[Sample]:
         """Take a packet, and yield the windows that are complete with it."""
-        name = field_of(type(packet).__name__, getattr(packet, "encoding", ""))
+        name = field_of(schema_of(type(packet)), getattr(packet, "encoding", ""))
         if name is None or self._watched.get(name) != packet.sensor:
             return
         if isinstance(packet, Events):

@@ -29,7 +29,7 @@ from neurosim_core.io.event_file import (
     events_of,
     in_microseconds,
 )
-from neurosim_core.packets import EventArrays, Events, Packet, packet_class
+from neurosim_core.packets import EventArrays, Packet
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, recording
 from neurosim_core.record.chunks import read_rows
 from neurosim_core.record.hdf5 import FORMAT, import_h5py
@@ -84,7 +84,7 @@ class Hdf5Source(EventSource):
         if self._file.attrs.get("format") != FORMAT:
             return
         with Recording(self._path) as recording:
-            others = [name for name in recording.sensors if not issubclass(_class(recording, name), Events)]
+            others = [name for name in recording.sensors if not recording.schema(name).has_events]
             if others:
                 yield from recording.packets(*others)
 
@@ -183,7 +183,3 @@ class RecordingSink:
 def _parts_of(found: Any) -> set[str]:
     """Return the names of the columns of a group, or of a dataset of records."""
     return {*(found if hasattr(found, "keys") else found.dtype.names or ())}
-
-
-def _class(recording: Recording, sensor: str) -> type[Packet]:
-    return packet_class(recording.schema(sensor))

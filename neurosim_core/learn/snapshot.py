@@ -13,7 +13,7 @@ from neurosim_core.learn.task import Task
 from neurosim_core.runtime.cuda import RecordedLaunch
 
 _LEFT_OUT = {  # what never changes, what each step writes before it reads it, and what is of this process
-    "_scenes", "_model", "_routes", "_timetable", "_observations", "observation", "_status", "buffers",
+    "_scenes", "_model", "_routes", "_observations", "observation", "_status", "buffers",
     "slots", "graphs", "results", "stack", "pictures", "shared_pictures", "_offsets_ns", "_hosts",
 }  # fmt: skip
 
@@ -23,7 +23,7 @@ Place = tuple[str, Any, str, Any]
 
 def state_of(env: Any) -> list[Place]:
     """Return all that a step of an environment may change, as it is now."""
-    cameras = [pair for group in env.sim._state.groups for pair in group.world_frames.items()]
+    cameras = [pair for group in env.sim._state.groups for pair in group.frames.items()]
     sensors = env.sim.model.config.sensors
     forgetful = [name for name, sensor in sensors.items() if getattr(sensor, "remembers", False)]
     forgetful += [name for name, camera in cameras if camera.terms]

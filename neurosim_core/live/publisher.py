@@ -17,9 +17,9 @@ from neurosim_core.live.config import NO_LINK
 from neurosim_core.live.links import Link, payload_bytes
 from neurosim_core.live.loans import PictureLoan
 from neurosim_core.live.pacing import Timings
-from neurosim_core.packets import Delivery, Image, Odometry, Packet
+from neurosim_core.packets import Delivery, Image, Odometry, Packet, schema_of
 from neurosim_core.record import describe_sensors
-from neurosim_core.sensors.event_camera import EventSensorConfig
+from neurosim_core.sensors.base import CameraConfig, SensorConfig
 from neurosim_core.sim import COLLISION, Model
 
 _PIXEL_EVENTS_HZ = 100.0
@@ -328,13 +328,13 @@ class PacketPublisher:
         self.deliver(topic.link.send(packet, stamp_ns=packet.stamp_ns, size_bytes=size_bytes), topic.name)
 
 
-def _expected_bytes(sensor: object) -> int:
+def _expected_bytes(sensor: SensorConfig | None) -> int:
     """Return a size that messages of an event camera hardly exceed [bytes]; 0 for other sensors.
 
     Memory that is made before the flight delays no message in it: pixels fire at most about 100 times a
     second on average, also in fast flight.
     """
-    if not isinstance(sensor, EventSensorConfig):
+    if not (isinstance(sensor, CameraConfig) and schema_of(sensor.packet_type).has_events):
         return 0
     window_s = sensor.packets.stamp_ns(1) * 1e-9
     count = _PIXEL_EVENTS_HZ * window_s * sensor.lens.width * sensor.lens.height

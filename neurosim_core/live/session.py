@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import yaml
 
 from cortex import Closed, Node, Subscriber, TypeMismatch, keep_last, latest
@@ -19,6 +18,7 @@ from neurosim_core.live.call import SensorRates, describe_status
 from neurosim_core.live.messages import sensor_message_type, setpoint_of, to_packet
 from neurosim_core.record.header import SensorDescription, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
+from neurosim_core.sensors.odometry import OdometrySensorConfig
 from neurosim_core.view.rerun_log import RerunLogger
 from neurosim_core.view.rerun_sdk import RerunFiles
 from neurosim_core.view.rerun_shapes import SceneShapes, scene_shapes
@@ -307,17 +307,9 @@ def _shown(config: SimulationConfig, only: Sequence[str] | None) -> dict[str, tu
     known = list(dict.fromkeys(["odometry", *(s.name for own in sensors.values() for s in own)]))
     if unknown := [name for name in only or () if name not in known]:
         raise ValueError(f"unknown sensor {unknown[0]!r}, known: {', '.join(known)}")
-    odometry = SensorDescription(
-        name="odometry",
-        kind="odometry",
-        rate_hz=config.control.rate_hz,
-        position=np.zeros(3),
-        orientation=np.array([0.0, 0.0, 0.0, 1.0]),
-    )
+    odometry, *_ = describe_sensors({"odometry": OdometrySensorConfig(rate_hz=config.control.rate_hz)})
+    shown = known if only is None else only
     return {
-        name: (
-            odometry,
-            *(s for s in own if s.kind != "odometry" and (only is None or s.name in only)),
-        )
+        name: (odometry, *(s for s in own if s.kind != odometry.kind and s.name in shown))
         for name, own in sensors.items()
     }

@@ -19,7 +19,6 @@ from neurosim_core.live.config import NO_LINK
 from neurosim_core.live.publisher import PacketPublisher
 from neurosim_core.packets import Collision, Packet
 from neurosim_core.sim import COLLISION, Batch, Model, StartState, State
-from neurosim_core.sim.schedule import batch_end_ns
 from neurosim_core.vehicle.command_ranges import command_ranges
 
 _PENDING_PERIODS = (2, 100)
@@ -78,7 +77,7 @@ class VehicleNode:
         slowest_ns = max((group.rate.stamp_ns(1) for group in model.groups), default=0)
         least, most = _PENDING_PERIODS
         self.period_count_max = min(max(-(-slowest_ns // period_ns), least), most)
-        batch_ns = batch_end_ns(model.schedule, 0, period_ns)
+        batch_ns = model.schedule.batch_end_ns(0, period_ns)
         self._batches_per_period = -(-period_ns // max(batch_ns, 1)) + 1  # one more where rates do not divide
         self.awaited_ns: int | None = None
         self._before_reset_ns = 0

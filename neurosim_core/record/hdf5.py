@@ -141,7 +141,7 @@ class RecordingWriter:
         # The oldest format: many programs read it, and no mark "open for writing" bars a killed file. Freed
         # space is never reused: what is on disk stays valid until the next flush is complete.
         self._file = h5py.File(self._disk, "w", libver=("earliest", "v110"), fs_strategy="none")
-        cameras = [s.name for s in header.sensors if s.kind == "event_camera"]
+        cameras = [s.name for s in header.sensors if s.has_events]
         self._root_camera = cameras[0] if cameras else None
         # A daemon, which works until the interpreter has called all its exit handlers.
         threading.Thread(target=self._write_flushes, name="recording", daemon=True).start()

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurosim_core.packets import schema_of
+
 if TYPE_CHECKING:
     from neurosim_core.sensors.base import SensorConfig
 
@@ -57,6 +59,8 @@ class SensorDescription:
     """The lens, for cameras."""
     settings: str = "{}"
     """All settings of the sensor (thresholds, noise, ...), as JSON."""
+    has_events: bool = False
+    """Whether its packets are known to hold events."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,7 +93,7 @@ def describe_sensors(sensors: Mapping[str, SensorConfig]) -> tuple[SensorDescrip
 
 def _describe(name: str, sensor: Any) -> SensorDescription:
     mount, lens = getattr(sensor, "mount", None), getattr(sensor, "lens", None)
-    more: dict[str, Any] = {}
+    more: dict[str, Any] = {"has_events": schema_of(sensor.packet_type).has_events}
     if mount is not None:
         more["position"] = np.array(mount.position_m)
         more["orientation"] = mount.quaternion() if lens is None else mount.optical_quaternion()

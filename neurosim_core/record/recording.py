@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurosim_core.packets import EventArrays, Events, GenericPacket, Packet, PacketSchema, packet_class
+from neurosim_core.packets import EventArrays, GenericPacket, Packet, PacketSchema, packet_class
 from neurosim_core.record.chunks import read_rows
 from neurosim_core.record.hdf5 import FORMAT, FORMAT_VERSION, import_h5py
 from neurosim_core.record.header import Intrinsics, RecordingHeader, SensorDescription
@@ -141,20 +141,13 @@ class Recording:
             ValueError: No such sensor, or not an event camera.
         """
         stream = self._stream(sensor)
-        if not issubclass(stream.packet_class, Events):
+        if not stream.schema.has_events:
             raise ValueError(f"sensor {sensor!r} sends {stream.schema.name}, not Events")
-        total = stream.end("event", stream.packet_count)
         start_us, end_us = (-(-round(s * 1e9) // 1000) for s in (start_s, end_s))  # first whole microsecond
-        index = stream.group["ms_to_idx"]
-
-        def first_at(millisecond: int) -> int:
-            return min(int(index[millisecond]), total) if millisecond < len(index) else total
-
-        low = first_at(max(start_us // 1000, 0))
-        high = first_at(max(end_us // 1000 + 1, 0))
-        columns = [read_rows(stream.group[DSEC_NAMES[name]], low, high) for name in EventArrays._fields]
-        begin, end = np.searchsorted(columns[0], [start_us, end_us])
-        return EventArrays(*(values[begin : max(begin, end)] for values in columns))
+        total = stream.end("event", stream.packet_count)
+        events = read_milliseconds(stream.group, start_us, end_us, event_count=total)
+        begin, end = np.searchsorted(events.t, [start_us, end_us])
+        return events.rows(slice(begin, max(begin, end)))
 
     def _stream(self, sensor: str) -> _Stream:
         if sensor not in self._streams:
@@ -183,7 +176,7 @@ class _Stream:
             )
         self._constants: dict[str, Any] = {}
         self._datasets: dict[str, Any] = {}
-        dsec = DSEC_NAMES if issubclass(self.packet_class, Events) else {}
+        dsec = DSEC_NAMES if self.schema.has_events else {}
         for field in self.schema.fields:
             if field.constant:
                 self._constants[field.name] = read_constant(group, field.name)
@@ -240,6 +233,17 @@ class _Stream:
             stamp_ns, sequence, order = (int(header[name][row]) for name in HEADER_COLUMNS)
             packet = self.packet_class(stamp_ns=stamp_ns, sequence=sequence, sensor=self.name, **values)
             yield stamp_ns, order, packet
+
+
+def read_milliseconds(group: Any, start_us: int, end_us: int, *, event_count: int) -> EventArrays:
+    """Return the events of the whole milliseconds from that of `start_us` to that of `end_us`.
+
+    `group`: of a camera in the file. `event_count`: how many of its events are complete.
+    """
+    index = group["ms_to_idx"]
+    milliseconds = (max(start_us // 1000, 0), max(end_us // 1000 + 1, 0))
+    low, high = (min(int(index[ms]), event_count) if ms < len(index) else event_count for ms in milliseconds)
+    return EventArrays(*(read_rows(group[DSEC_NAMES[name]], low, high) for name in EventArrays._fields))
 
 
 @contextlib.contextmanager
@@ -299,4 +303,5 @@ def _read_sensor(group: Any) -> SensorDescription:
         orientation=np.asarray(group.attrs["q_BS_xyzw"]),
         intrinsics=intrinsics,
         settings=str(group.attrs["settings"]),
+        has_events="events" in group,
     )

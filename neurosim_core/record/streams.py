@@ -51,8 +51,7 @@ class Stream:
         """The result of `_form_of` for packets that fit."""
         group.attrs["packet"], group.attrs["schema"] = schema.name, schema.to_json()
         self._packet_count = group.create_dataset("packet_count", data=np.int64(0))
-        self.is_events = all(self._varying.get(name) == "event" for name in DSEC_NAMES)
-        """Whether it is an event camera."""
+        self.is_events = schema.has_events
         self._flat_chunk = _FLAT_CHUNK
         if self.is_events:
             pixels = self._fixed["width"] * self._fixed["height"]

@@ -10,11 +10,13 @@ an array that is freed between two launches holds up both: what runs ahead of th
 from __future__ import annotations
 
 import ctypes
+import itertools
 import weakref
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -40,6 +42,15 @@ _POOLED_COUNT_MIN = 3
 """So many blocks readers may hold however large they are: who reads one after the other holds two."""
 
 
+class Launches(NamedTuple):
+    """Some launches, which may be recorded in a graph."""
+
+    key: Hashable | None
+    """Same key, same launches and arguments; None: they do not come again, or more than launches is done."""
+    launch: Callable[[], object]
+    """Launches them on the current stream; returns what a graph of them must keep."""
+
+
 def size_class(size: int) -> int:
     """Return the least of 2^n and 3 * 2^n that is not below a size, at least 1: few sizes serve for many."""
     power = 1 << max(0, size - 1).bit_length()
@@ -55,24 +66,20 @@ def make_stream(device: Any, *, high_priority: bool = False) -> wp.Stream | None
 class _On:
     """Makes a stream the current one; `wp.ScopedStream` also sets the device, and takes twice as long."""
 
-    def __init__(self, stream: wp.Stream, after: bool) -> None:
+    def __init__(self, stream: wp.Stream) -> None:
         self._stream = stream
-        self._after = after
 
     def __enter__(self) -> None:
         self._before = self._stream.device.stream
-        self._stream.device.set_stream(self._stream, sync=self._after)
+        self._stream.device.set_stream(self._stream, sync=True)
 
     def __exit__(self, *_: object) -> None:
         self._stream.device.set_stream(self._before, sync=False)
 
 
-def use_stream(stream: wp.Stream | None, *, after: bool = True) -> AbstractContextManager[Any]:
-    """Launch the kernels of a block on a stream; None: on the current one.
-
-    With `after` the stream first waits for all launches of the current one; without it, fences order them.
-    """
-    return nullcontext() if stream is None else _On(stream, after)
+def use_stream(stream: wp.Stream | None) -> AbstractContextManager[Any]:
+    """Launch the kernels of a block on a stream, behind all launches of the current one; None: there."""
+    return nullcontext() if stream is None else _On(stream)
 
 
 class Fence:
@@ -84,10 +91,10 @@ class Fence:
         self._behind: wp.Stream | None = None
         """A stream whose launches come after it anyway."""
 
-    def set(self, stream: wp.Stream | None = None) -> None:
-        """Record it behind all launches of a stream; None: of the current one."""
+    def set(self) -> None:
+        """Record it behind all launches of the current stream."""
         if self._event is not None:
-            self._behind = stream or self._device.stream
+            self._behind = self._device.stream
             self._behind.record_event(self._event)
 
     def wait(self) -> None:
@@ -114,31 +121,39 @@ class GraphCache:
         self._graphs: dict[Hashable, tuple[Any, Any]] = {}
         self.dropped_count = 0
 
-    def run(self, key: Hashable, launch: Callable[[], Any], *, stream: wp.Stream | None = None) -> None:
-        """Do what `launch` does, on a stream (None: the current one); same key, same launches and arguments.
+    def run(self, key: Hashable | None, launch: Callable[[], object]) -> None:
+        """Do what `launch` does, on the current stream; see `Launches`.
 
-        It is called the first time, which compiles and warms up, and the second time to record it. What it
-        returns is kept as long as the graph: arrays that nothing else holds. On a stream fences say what it
-        follows.
+        What has a key is called the first time, which compiles and warms up, and the second time to record
+        it. What it returns is kept as long as the graph: arrays that nothing else holds.
         """
-        if self._device.is_cpu:
+        if key is None or self._device.is_cpu:
             launch()
             return
         graph, kept = self._graphs.pop(key, (None, None))
         if graph is None:
-            with use_stream(stream, after=False):
-                launch()
+            launch()
             graph = False
         else:
             if graph is False:
-                with use_stream(stream, after=False), wp.ScopedCapture(self._device) as capture:
+                with wp.ScopedCapture(self._device) as capture:
                     kept = launch()
                 graph = capture.graph
-            wp.capture_launch(graph, stream)
+            wp.capture_launch(graph)
         if len(self._graphs) >= _GRAPH_COUNT_MAX:
             del self._graphs[next(iter(self._graphs))]
             self.dropped_count += 1
         self._graphs[key] = (graph, kept)  # at the end: the one that was not used for longest goes first
+
+    def run_all(self, launches: Sequence[Launches]) -> None:
+        """Launch one after the other, as few graphs: those that follow each other and have keys are one."""
+        for has_key, neighbours in itertools.groupby(launches, key=lambda each: each.key is not None):
+            keys, calls = zip(*neighbours, strict=True)
+            self.run(keys if has_key else None, partial(_call_all, calls))
+
+
+def _call_all(calls: Sequence[Callable[[], object]]) -> list[object]:
+    return [call() for call in calls]
 
 
 class RecordedLaunch:

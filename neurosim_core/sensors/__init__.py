@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING
 from neurosim_core.lazy import lazy_names
 
 if TYPE_CHECKING:  # isort: off
+    from neurosim_core.runtime.cuda import Launches as Launches
     from neurosim_core.sensors.base import (
         FrameContext as FrameContext,
+        FrameSensor as FrameSensor,
         FrameSensorConfig as FrameSensorConfig,
         ImageSensorConfig as ImageSensorConfig,
         PictureContext as PictureContext,

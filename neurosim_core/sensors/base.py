@@ -23,6 +23,7 @@ from neurosim_core.packets import Image, ImageEncoding, Packet, schema_of
 from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.lenses import AnyLens
 from neurosim_core.render.ray_times import RayTimes, RayTiming, ShutterConfig
+from neurosim_core.runtime.cuda import Launches
 from neurosim_core.settings import BaseConfig
 from neurosim_core.vehicle import Multirotor
 
@@ -365,34 +366,66 @@ class ImageSensorConfig(CameraConfig, PictureSensorConfig):
         return packet
 
 
-class FrameSensor(Protocol):
-    """A frame sensor at work in one world, whose packets go to the host."""
+class FrameSensor(ABC):
+    """A frame sensor at work in all worlds: it sees every instant that is rendered for it.
 
-    terms: tuple[str, ...]
-    watching: bool
-    """It has a reference, and saw every instant that was rendered since."""
+    What it makes of the frames stays on the device, in `results`, or goes to the host as packets: the context
+    says which is wanted (`FrameContext.on_host`). Frames come batch by batch: `plan` for each, and where
+    there are packets `begin_read` for the oldest one that was not read.
 
-    def see(self, frames: Any, stamps_ns: Sequence[int]) -> None:
-        """Launch what it makes of the frames of a batch.
+    Attributes:
+        terms: What is computed beyond what every such sensor needs.
+        results: What it found in the last batch, on the device.
+    """
+
+    terms: tuple[str, ...] = ()
+    results: Any = None
+
+    @abstractmethod
+    def begin(self, frames: Any, stamp_ns: int, mask: Any) -> None:
+        """Take the first frame of each world as its reference.
 
         Args:
-            frames: Log radiance, device array of float32, shape [>= K, H, W]; stays as it is until the batch
-                has been read.
-            stamps_ns: Times of the first K frames [ns], increasing.
+            frames: As of `plan`.
+            stamp_ns: Time of the first frame [ns].
+            mask: Not 0 where a world begins, device array of int32, shape [N].
+        """
+
+    @abstractmethod
+    def plan(self, frames: Any, stamps_ns: Sequence[int], end_ns: int) -> Launches | None:
+        """Return what makes something of the frames of a batch; None: nothing is to be done.
+
+        Args:
+            frames: Log radiance, device array of float32, shape [N K, H, W]; stays as it is until the batch
+                has been read. It is there when the launches run.
+            stamps_ns: Times of the first frames of each world [ns], at most K, increasing.
+            end_ns: End of the batch [ns].
         """
 
     def begin_read(self, stamps_ns: Sequence[int], *, until_ns: int) -> Callable[[], list[Packet]]:
         """Wait for the oldest batch; return the function that returns the packets that end in it.
 
-        That function is called next, or after the `see` of one more batch.
+        That function is called next, or after the launches of one more batch.
 
         Args:
             stamps_ns: Times of the frames of the batch [ns].
             until_ns: Packets that end later are not returned [ns].
         """
+        raise NotImplementedError(f"{type(self).__name__} has no packets: its results stay on the device")
 
     def flush(self, *, until_ns: int) -> list[Packet]:
         """Return the packet that has begun and not ended, cut at a stamp [ns]."""
+        return []
+
+    def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None) -> None:
+        """Draw what stays in the pixels of some worlds anew; waits for the device.
+
+        Args:
+            seeds: Seed of each world, of all N.
+            worlds: Indices of the worlds whose pixels are drawn; None: all.
+        """
+        if self.terms:
+            raise NotImplementedError(f"{type(self).__name__} cannot draw its noise anew")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -400,12 +433,25 @@ class FrameContext:
     """The context that a frame sensor is made in."""
 
     name: str
+    """Its name in the settings; two sensors with different names have independent noise."""
+    configs: Sequence[Any]
+    """Its settings in each world."""
+    lens: Lens
     device: str
+    on_host: bool
+    """There is one world, and packets of it are wanted; else results stay on the device."""
     in_flight: int
     """The most batches that it has seen and that were not read."""
-    seed: int
-    """Of the episode."""
-    lens: Lens
+    instant_count: int
+    """K, the most frames of a world in one batch."""
+    capacity: int
+    """Room for results of one world in one batch (`FrameSensorConfig.world_capacity`)."""
+    ordered: bool
+    """Sort the results of each world."""
+    seeds: Sequence[int]
+    """Of each world."""
+    clock_ns: Any
+    """Time of each world at the end of the batch [ns], device array of int64, shape [N]."""
     scene: Any
     """As the renderer has it."""
     motions: Any
@@ -418,69 +464,11 @@ class FrameContext:
     """Orientation of the camera against the body, quatd."""
 
 
-class WorldFrameSensor(Protocol):
-    """A frame sensor at work in all worlds, whose results stay on the device.
-
-    Its pixels have two states, the present one and that after the next frames, which take turns: the *parity*
-    of a step says which is the present one.
-    """
-
-    terms: tuple[str, ...]
-
-    @property
-    def results(self) -> Any:
-        """The results of the last step, on the device."""
-
-    def begin(self, mask: Any, parity: int) -> None:
-        """Let worlds whose mask (int32, [N]) is not 0 take frame 0 as their reference; launches only."""
-
-    def offsets(self, offsets_ns: tuple[int, ...]) -> Any:
-        """Return offsets of a step on the device; whoever makes a graph with them keeps them."""
-
-    def find(self, clock_ns: Any, offsets_ns: tuple[int, ...], parity: int) -> None:
-        """Look at the frames of a step; launches only, on CUDA.
-
-        Args:
-            clock_ns: Time of each world at the beginning of the step [ns], int64, shape [N].
-            offsets_ns: From there to the last frame seen before (<= 0), and to each frame [ns].
-            parity: Which of the two states is the present one, 0 or 1.
-        """
-
-    def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None) -> None:
-        """Draw what stays in the pixels of some worlds anew; waits for the device.
-
-        Args:
-            seeds: Seed of each world, of all N.
-            worlds: Indices of the worlds whose pixels are drawn; None: all.
-        """
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class WorldFrameContext:
-    """The context that a frame sensor of many worlds is made in."""
-
-    name: str
-    configs: Sequence[Any]
-    """Its settings in each world."""
-    frames: Any
-    """Log radiance of all worlds, float32, shape [N, K, H W]."""
-    capacity: int
-    """Room for results of one world in one step (`FrameSensorConfig.world_capacity`)."""
-    seeds: Sequence[int]
-    """Of each world."""
-    ordered: bool
-    """Sort the results of each world."""
-
-
 class FrameSensorConfig(CameraConfig):
     """A camera that sees every instant that is rendered for it."""
 
-    def make(self, context: FrameContext) -> FrameSensor:
-        """Return the sensor at work in one world."""
-        raise NotImplementedError(f"{type(self).__name__} must say how it is made")
-
     def world_capacity(self, world_count: int, event_capacity: int | None) -> int:
-        """Return for how many results of each world there is room in a step.
+        """Return for how many results of each world there is room in a batch.
 
         Args:
             world_count: Number of worlds N.
@@ -491,10 +479,10 @@ class FrameSensorConfig(CameraConfig):
         """
         return event_capacity or 0
 
-    def make_worlds(self, context: WorldFrameContext) -> WorldFrameSensor:
-        """Return the sensor at work in many worlds.
+    def make(self, context: FrameContext) -> FrameSensor:
+        """Return the sensor at work.
 
         Raises:
-            ValueError: It cannot be in many worlds; the message says why.
+            ValueError: It cannot be in many worlds, or in one; the message says why.
         """
-        raise ValueError(f"{context.name!r} is for single runs")
+        raise NotImplementedError(f"{type(self).__name__} must say how it is made")

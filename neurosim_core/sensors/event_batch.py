@@ -122,12 +122,13 @@ class EventCameraBatch:
         self._shape = (count, height, width)
         self._seeds = [(seed + camera) % (1 << 64) for camera in range(count)]
         self._capacity = max(_ROOM_MIN, width * height // _PIXELS_PER_EVENT)
-        self._frames: Any = wp.zeros((count, 1, width * height), dtype=wp.float32, device=self.device)
+        self._frames: Any = wp.zeros(self._shape, dtype=wp.float32, device=self.device)
         self._cameras = WorldEventCamera(
             [config] * count,
             width=width,
             height=height,
-            frames=self._frames,
+            instant_count=1,
+            device=self.device,
             capacity=self._capacity,
             sensor=sensor,
             seeds=self._seeds,
@@ -138,16 +139,16 @@ class EventCameraBatch:
         self._all = wp.ones(count, dtype=wp.int32, device=self.device)
         self._counters = HostCopy(wp.zeros((count, 3), dtype=wp.int64, device=self.device))
         self._counters_out = self._counters.mapped()
-        self._frames_seen = self._cameras.stack.__ctype__().log_radiance
-        """Of the recorded launches' parameters: where they read frames."""
         self._begin = RecordedLaunch(event_kernels.begin_frame, self.device)
         self._move_counters = RecordedLaunch(event_kernels.move_counters, self.device)
         self._decode = RecordedLaunch(event_kernels.decode, self.device)
         self._offsets = HostInput(wp.zeros(count + 1, dtype=wp.int32, device=self.device))
-        self._scans = [self._cameras.record_scan(parity) for parity in (0, 1)] if self.device.is_cuda else []
+        self._cameras.look_at(self._frames)
+        self._frames_seen = self._cameras.stack.__ctype__().log_radiance
+        """Of the recorded launches' parameters: where they read frames."""
+        self._scans = [self._cameras.record_scan(state) for state in (0, 1)] if self.device.is_cuda else []
         self._readable: Any = None
         """Shape, type and device of the last array that was read where it is."""
-        self._parity = 0
         self._timing = (-1, -1)
         self._stamp_ns: int | None = None
         self._epoch_us = 0
@@ -166,14 +167,14 @@ class EventCameraBatch:
         Raises:
             ValueError: If shape or dtype is wrong, or a value is not finite or beyond +-1000.
         """
-        wp.copy(self._frames.reshape(self._shape), self._as_frames(log_radiance))
+        wp.copy(self._frames, self._as_frames(log_radiance))
         self._frames_seen.data = self._frames.ptr
         self._stamp_ns = None
         self.frame_number += 1
         self._epoch_us = int(stamp_ns) // NS_PER_US
         if self.terms:
             self._cameras.seed(self._seeds, reset_ns=int(stamp_ns))
-        self._cameras.begin(self._all, self._parity)
+        self._cameras.begin(self._frames, int(stamp_ns), self._all)
         self._read_counters()
         self._stamp_ns = int(stamp_ns)
 
@@ -202,15 +203,15 @@ class EventCameraBatch:
         self._begin_frame(start_ns, stamp_ns)
         self._frames_seen.data = address
         if self._scans:
-            self._scans[self._parity].launch()
+            self._scans[self._cameras.present].launch()
         else:
-            self._cameras.take_frames(1, ALL, self._parity)
+            self._cameras.take_frames(1, ALL, self._cameras.present)
         counts = self._read_counters()
         dropped_count = 0
         if max(counts) > self._capacity or max(counts) > self._event_count_max:
             counts, dropped_count = self._scan_again(start_ns, stamp_ns, max(counts))
         del held
-        self._parity = 1 - self._parity
+        self._cameras.present = 1 - self._cameras.present
         self._stamp_ns = stamp_ns
         self.frame_number += 1
         return FrameEvents(self, start_ns, stamp_ns, counts, dropped_count)
@@ -282,7 +283,7 @@ class EventCameraBatch:
         self._begin_frame(start_ns, stamp_ns)
         stack = self._cameras.stack
         stack.dropped.zero_()
-        self._cameras.find_keys(1, self._parity)
+        self._cameras.find_keys(1, self._cameras.present)
         counts = self._read_counters()
         dropped_count = int(stack.dropped.numpy().sum())
         stack.overflow.zero_()

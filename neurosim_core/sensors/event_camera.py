@@ -13,12 +13,13 @@ from pydantic import Field, model_validator
 from neurosim_core.clock import Rate
 from neurosim_core.packets import Events, Packet
 from neurosim_core.registry import register
+from neurosim_core.runtime.cuda import Launches
 from neurosim_core.sensors.base import (
     FrameContext,
+    FrameSensor,
     FrameSensorConfig,
     RateHz,
     RenderRequest,
-    WorldFrameContext,
 )
 from neurosim_core.sensors.event_config import EventCameraConfig, describe_pixel
 from neurosim_core.sensors.event_labels import EventLabel, EventLabels
@@ -96,10 +97,6 @@ class EventSensorConfig(FrameSensorConfig):
             required=self.packets if adaptive else None,
         )
 
-    def make(self, context: FrameContext) -> EventChannel:
-        """Return the camera at work in one world."""
-        return EventChannel(self, context)
-
     def world_capacity(self, world_count: int, event_capacity: int | None) -> int:
         """Return for how many events of each world there is room in a step."""
         capacity = event_capacity or max(_ROOM_MIN, 2 * self.lens.width * self.lens.height)
@@ -110,13 +107,15 @@ class EventSensorConfig(FrameSensorConfig):
             )
         return capacity
 
-    def make_worlds(self, context: WorldFrameContext) -> WorldEventCamera:
-        """Return the camera at work in many worlds."""
-        pixels = [config.pixel for config in context.configs]
+    def make(self, context: FrameContext) -> FrameSensor:
+        """Return the camera at work: with packets, or with results of all worlds."""
+        if context.on_host:
+            return EventChannel(self, context)
         if self.labels:
             raise ValueError(
                 f"labels of {context.name!r} are for single runs: packets have them, on the host"
             )
+        pixels = [config.pixel for config in context.configs]
         if any(pixel.readout is not None for pixel in pixels):
             raise ValueError(
                 f"readout of {context.name!r} is for single runs: events wait for each other on the host"
@@ -125,10 +124,12 @@ class EventSensorConfig(FrameSensorConfig):
             pixels,
             width=self.lens.width,
             height=self.lens.height,
-            frames=context.frames,
+            instant_count=context.instant_count,
+            device=context.device,
             capacity=context.capacity,
             sensor=context.name,
             seeds=context.seeds,
+            clock_ns=context.clock_ns,
             ordered=context.ordered,
         )
 
@@ -149,14 +150,8 @@ class EventSensorConfig(FrameSensorConfig):
         return self
 
 
-class EventChannel:
-    """An event camera of one world, whose packets go to the host.
-
-    Attributes:
-        camera: Finds the events.
-        terms: What is computed beyond ideal pixels.
-        watching: It has a reference, and saw every instant that was rendered since.
-    """
+class EventChannel(FrameSensor):
+    """An event camera of one world, whose packets go to the host."""
 
     def __init__(self, config: EventSensorConfig, context: FrameContext) -> None:
         terms = config.pixel.terms()
@@ -166,57 +161,59 @@ class EventChannel:
             if config.labels
             else None
         )
-        self.camera = EventCamera(
+        self._camera = EventCamera(
             config.pixel,
             width=context.lens.width,
             height=context.lens.height,
             device=context.device,
             sensor=context.name,
-            seed=context.seed,
+            seed=context.seeds[0],
             scan_count_max=context.in_flight,
             on_host=True,
             terms=(*terms, CAUSE) if has_cause else None,
             labels=self._labels,
         )
         self.terms = (
-            *self.camera.terms,
+            *self._camera.terms,
             *(f"{label} of events" for label in config.labels if label != CAUSE),
         )
-        self.watching = False
         self._packets = config.packets
         self._sequence = 0
         self._seen_ns = 0
 
-    def see(self, frames: Any, stamps_ns: Sequence[int]) -> None:
-        """Launch the scan of the instants of a batch; the first that it sees is its reference."""
-        if self._labels is not None:
-            self._labels.note_flown()
-        first = 0
-        if not self.watching:
-            self.camera.reset(frames[0], stamps_ns[0], sequence=self._sequence)
-            self.watching = True
-            first = 1
-        stamps_ns = stamps_ns[first:]
-        if stamps_ns:
-            self.camera.feed_device(frames[first:] if first else frames, stamps_ns)
+    def begin(self, frames: Any, stamp_ns: int, mask: Any) -> None:
+        """Take the first frame as the reference; waits for it."""
+        self._camera.reset(frames[0], stamp_ns, sequence=self._sequence)
+
+    def plan(self, frames: Any, stamps_ns: Sequence[int], end_ns: int) -> Launches | None:
+        """Return what scans the instants of a batch; the camera records it itself."""
+        if not stamps_ns:
+            return None
+
+        def scan() -> None:
+            if self._labels is not None:
+                self._labels.note_flown()
+            self._camera.feed_device(frames, stamps_ns)
+
+        return Launches(None, scan)
 
     def begin_read(self, stamps_ns: Sequence[int], *, until_ns: int) -> Callable[[], list[Packet]]:
         """Wait for the oldest batch; return what gives the packets whose windows end in it."""
-        begun_ns = self.camera.window_start_ns
+        begun_ns = self._camera.window_start_ns
         ticks = self._packets.stamps(stamps_ns[0], stamps_ns[-1] + 1)
         ends = [tick for tick in ticks if tick in stamps_ns and begun_ns < tick <= until_ns]
-        fed = stamps_ns[-1] > self.camera.stamp_ns
+        fed = stamps_ns[-1] > self._camera.stamp_ns
         self._seen_ns = max((stamp for stamp in stamps_ns if stamp <= until_ns), default=self._seen_ns)
-        hand_out = self.camera.begin_windows(ends, scan_count=int(fed))
+        hand_out = self._camera.begin_windows(ends, scan_count=int(fed))
         self._sequence += len(ends)
         return lambda: self._labelled(hand_out())
 
     def flush(self, *, until_ns: int) -> list[Packet]:
         """Return the packet whose window has begun and not ended, cut at the last instant until a stamp."""
         cut_ns = min(until_ns, self._seen_ns)
-        if not self.watching or self.camera.window_start_ns >= cut_ns:
+        if self._camera.window_start_ns >= cut_ns:
             return []
-        packets = self.camera.collect_windows([cut_ns], scan_count=0)
+        packets = self._camera.collect_windows([cut_ns], scan_count=0)
         self._sequence += 1
         return self._labelled(packets)
 

@@ -40,7 +40,7 @@ def begin_step(
     # In/out:
     stack: Stack,
 ) -> None:
-    """Set the stamps of a world (`WorldFrameSensor.find`); forget counts and limits of the step before."""
+    """Set the stamps of a world, of offsets from its clock; forget counts and limits of the step before."""
     world = wp.tid()
     origin_us = (clock_ns[world] + offsets_ns[0]) // _US
     stack.origin_us[world] = origin_us

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,9 @@ import numpy as np
 import warp as wp
 
 from neurosim_core.render.launch import core_count, share
+from neurosim_core.runtime.cuda import Launches
 from neurosim_core.sensors import event_kernels
+from neurosim_core.sensors.base import FrameSensor
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_frame_scan import PIXELS_PER_THREAD, scan_frame
 from neurosim_core.sensors.event_pixels import PixelStates, make_stack
@@ -66,7 +68,7 @@ class WorldEvents:
         return tuple(np.array(column[begin:end].numpy()) for column in columns)  # type: ignore[return-value]
 
 
-class WorldEventCamera:
+class WorldEventCamera(FrameSensor):
     """Finds the events of one camera of the rig in all worlds.
 
     Each world gives the events that an `EventCamera` gives alone, also where there are too many: of a step
@@ -77,12 +79,17 @@ class WorldEventCamera:
         configs: The pixels of each world.
         width: Width of the sensor [px].
         height: Height of the sensor [px].
-        frames: Log radiance of all worlds, float32, shape [world, K, pixel]; read at each scan.
+        instant_count: K, the most frames of a world in one step.
+        device: Where frames and events are.
         capacity: Room for events of one world in one step.
         sensor: Name of the sensor: noise depends on it.
         seeds: Seed of each world.
+        clock_ns: Time of each world at the end of a step [ns], int64, shape [world]; for `plan`.
         ordered: Sort the events of each world.
         decodes: Have room for `results`; False: somebody else reads the keys.
+
+    Attributes:
+        present: Which of the two states of the pixels is the present one; the other is that after a scan.
     """
 
     def __init__(
@@ -91,15 +98,17 @@ class WorldEventCamera:
         *,
         width: int,
         height: int,
-        frames: wp.array3d[wp.float32],
+        instant_count: int,
+        device: Any,
         capacity: int,
         sensor: str,
         seeds: Sequence[int],
+        clock_ns: wp.array[wp.int64] | None = None,
         ordered: bool = True,
         decodes: bool = True,
     ) -> None:
-        self.device: Any = wp.get_device(frames.device)
-        world_count, frame_count, pixel_count = frames.shape
+        self.device: Any = wp.get_device(device)
+        world_count = len(configs)
         self._ordered = ordered
         self._event_count_max: Any = wp.array(
             [config.event_count_max for config in configs], dtype=wp.int32, device=self.device
@@ -117,16 +126,17 @@ class WorldEventCamera:
         )
         self.terms: tuple[str, ...] = terms
         """Terms beyond ideal pixels that some world needs: some of `event_noise_model.TERMS`."""
-        self.seed = self._states.seed
         self.layout = self._states.layout
-        self._shape = (world_count, pixel_count)
-        self.stack = make_stack(world_count, frame_count, height, self.device)
+        self._shape = (world_count, width * height)
+        self.stack = make_stack(world_count, instant_count, height, self.device)
         """The input and the output of a step, `event_kernels.Stack`."""
-        self.stack.log_radiance = frames
+        self.present = 0
+        self._frames: Any = None
+        self._seen_ns = 0
+        self._clock_ns = clock_ns
         self.grow(capacity)
         self._sections = self._zeros(-(-world_count // int(event_kernels.SECTION)), wp.int64)
-        self.offsets = functools.lru_cache(_OFFSETS_MAX)(self._upload_offsets)
-        """Returns offsets of a step on the device; see `WorldFrameSensor.offsets`."""
+        self._offsets = functools.lru_cache(_OFFSETS_MAX)(self._upload_offsets)
         room = world_count * capacity if decodes else 0
         self.results = WorldEvents(
             t=self._empty(room, wp.int64),
@@ -146,8 +156,9 @@ class WorldEventCamera:
         """Thresholds of each world, up and down, device array of vec2d, shape [world]; None: others count."""
         return None if self.terms else self._states.thresholds
 
-    def begin(self, mask: wp.array[wp.int32], parity: int) -> None:
+    def begin(self, frames: wp.array3d[wp.float32], stamp_ns: int, mask: wp.array[wp.int32]) -> None:
         """Let worlds whose mask is not 0 take frame 0 as reference; forget all events; launches only."""
+        self.look_at(frames)
         for array in (self.results.offsets, self.results.counts, self.stack.dropped, self.stack.counters):
             array.zero_()
         states = self._states
@@ -155,39 +166,57 @@ class WorldEventCamera:
             event_kernels.begin_pixels,
             dim=self._shape,
             inputs=[mask, self.stack.log_radiance],
-            outputs=[states.ring[parity], self.stack.counters],
+            outputs=[states.ring[self.present], self.stack.counters],
             device=self.device,
         )
-        states.begin_noise(mask, parity)
+        states.begin_noise(mask, self.present)
+        self._seen_ns = stamp_ns
+
+    def plan(self, frames: wp.array3d[wp.float32], stamps_ns: Sequence[int], end_ns: int) -> Launches:
+        """Return what finds the events of a step; see `FrameSensor.plan`."""
+        self.look_at(frames)
+        offsets_ns = (self._seen_ns - end_ns, *(stamp_ns - end_ns for stamp_ns in stamps_ns))
+        offsets, count, present = self._offsets(offsets_ns), len(stamps_ns), self.present
+        if stamps_ns:
+            self._seen_ns, self.present = stamps_ns[-1], 1 - present
+        return Launches((offsets_ns, present), lambda: self._find(offsets, count, present))
+
+    def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None, *, reset_ns: int = 0) -> None:
+        """Draw what stays in the pixels of some worlds anew; see `PixelStates.seed`."""
+        self._states.seed(seeds, worlds, reset_ns=reset_ns)
+
+    def look_at(self, frames: wp.array3d[wp.float32]) -> None:
+        """Read frames, shape [world K, H, W], at the scans that follow."""
+        if frames is not self._frames:
+            self._frames = frames
+            self.stack.log_radiance = frames.reshape((self._shape[0], -1, self._shape[1]))
 
     def _upload_offsets(self, offsets_ns: tuple[int, ...]) -> Any:
         return wp.array(np.array(offsets_ns, dtype=np.int64), dtype=wp.int64, device=self.device)
 
-    def find(self, clock_ns: wp.array[wp.int64], offsets_ns: tuple[int, ...], parity: int) -> None:
-        """Find the events of a step; launches only, on CUDA; see `WorldFrameSensor.find`.
+    def _find(self, offsets_ns: wp.array[wp.int64], frame_count: int, present: int) -> object:
+        """Find the events of a step; launches only, on CUDA.
 
-        Offsets were seen before on the host, so that nothing is allocated. The other of the two states is the
-        present one after this, if there is a frame.
+        Offsets are from the end of the step to the last frame before it, and to each frame [ns].
         """
-        frame_count = len(offsets_ns) - 1
-        offsets = self.offsets(offsets_ns)
-        self._launch(event_kernels.begin_step, self._shape[0], [clock_ns, offsets], [self.stack])
+        self._launch(event_kernels.begin_step, self._shape[0], [self._clock_ns, offsets_ns], [self.stack])
         if frame_count > 0:
-            self.find_keys(frame_count, parity)
+            self.find_keys(frame_count, present)
         self._hand_out()
+        return offsets_ns
 
-    def find_keys(self, frame_count: int, parity: int) -> None:
+    def find_keys(self, frame_count: int, present: int) -> None:
         """Scan the frames of a step that has begun, and drop the events that do not fit."""
         world_count = self._shape[0]
-        self.take_frames(frame_count, ALL, parity)
+        self.take_frames(frame_count, ALL, present)
         self._launch(
             event_kernels.find_overflow, world_count, [self._capacity, self._event_count_max], [self.stack]
         )
         if self.device.is_cuda or self.stack.overflow.numpy().any():
-            self.take_frames(frame_count, COUNT, parity)
+            self.take_frames(frame_count, COUNT, present)
             each = self._capacity // frame_count
             self._launch(event_kernels.limit_rows, world_count, [each, self._event_count_max], [self.stack])
-            self.take_frames(frame_count, AGAIN, parity)
+            self.take_frames(frame_count, AGAIN, present)
 
     def grow(self, capacity: int) -> None:
         """Have room for more keys; those there are are lost."""
@@ -233,23 +262,23 @@ class WorldEventCamera:
         parts = min(core_count(), world_count)
         share(sort, list(itertools.pairwise(world_count * part // parts for part in range(parts + 1))))
 
-    def take_frames(self, frame_count: int, part: int, parity: int) -> None:
-        """Scan all pixels."""
-        self._states.launch(self.stack, parity, 1 - parity, frame_count=frame_count, part=part)
+    def take_frames(self, frame_count: int, part: int, present: int) -> None:
+        """Scan all pixels from one of their two states to the other."""
+        self._states.launch(self.stack, present, 1 - present, frame_count=frame_count, part=part)
 
-    def record_scan(self, parity: int) -> Any:
+    def record_scan(self, present: int) -> Any:
         """Return the launch of the scan of one frame of all worlds, on CUDA; `stack` may change meanwhile."""
         states = self._states
         if self.terms:
-            return states.launch(self.stack, parity, 1 - parity, frame_count=1, record_cmd=True)
+            return states.launch(self.stack, present, 1 - present, frame_count=1, record_cmd=True)
         world_count, pixel_count = self._shape
         blocks = -(-pixel_count // (BLOCK_SIZE * PIXELS_PER_THREAD))
         return wp.launch(
             scan_frame,
             dim=(world_count, blocks * BLOCK_SIZE),
             block_dim=BLOCK_SIZE,
-            inputs=[states.thresholds, self.layout, states.ring[parity], self.stack],
-            outputs=[states.ring[1 - parity]],
+            inputs=[states.thresholds, self.layout, states.ring[present], self.stack],
+            outputs=[states.ring[1 - present]],
             device=self.device,
             record_cmd=True,
         )

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Hashable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from neurosim_core.packets import Image, Packet
 from neurosim_core.render.outputs import INSTANT_OUTPUTS
-from neurosim_core.runtime.cuda import use_stream
+from neurosim_core.runtime.cuda import Launches
 from neurosim_core.runtime.pinned import PinnedMapping
 from neurosim_core.runtime.timing import timed
 from neurosim_core.scene.bodies import pose_bodies
-from neurosim_core.sensors.base import PictureViews
+from neurosim_core.sensors.base import FrameSensor, PictureViews
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.render_group import BatchBuffers, RenderGroupState
 from neurosim_core.sim.state import Batch, State
@@ -57,38 +57,19 @@ class RenderJob:
     """Buffers of the caller that pictures are copied to, by camera and stamp."""
 
 
-def launch_cameras(model: Model, state: State, batch: Batch) -> None:
-    """Let the cameras that are wanted see a batch, and launch the copies to the host."""
-    chosen = choose(model, state, batch) if batch.jobs is None else ()
-    stream = state.render_streams[batch.number % len(state.batch_done)]
-    with timed(state.wall_s, "render"), use_stream(stream):
-        state.flown[batch.number % state.render_backlog].wait_on_stream()
-        for job in plan_jobs(state, batch, chosen):
-            acquire_picture_buffers(job)
-            if (key := launch_key(job)) is None:
-                render(job)
-            else:
-                state.graphs.run(key, partial(render, job))
-        state.rendered.set()
-    with use_stream(state.event_stream):
-        state.rendered.wait_on_stream()
-        scan(state, batch)
-
-
-def choose(model: Model, state: State, batch: Batch) -> list[list[int]]:
+def _choose(model: Model, state: State, batch: Batch) -> list[list[int]]:
     """Return which boundaries of a batch each group has to render; adaptive groups wait for the flight."""
     chosen: list[list[int]] = []
     for index, group in enumerate(state.groups):
-        disable_frame_sensors(group, batch.wanted)
-        always = bool(group.world_frames) or any(name in batch.wanted for name in group.frames)
+        group.watching &= batch.wanted
+        always = any(name in batch.wanted for name in group.frames)
         due = [
             place
             for place, boundary in enumerate(batch.boundaries)
             if index in boundary.groups and (always or is_due(group, boundary.stamp_ns, batch.wanted))
         ]
         if group.rule is not None and due:
-            with timed(state.wall_s, "choice of renders"), use_stream(state.choice_stream):
-                state.flown[batch.number % state.render_backlog].wait_on_stream()
+            with state.pipeline.choice(batch.number):
                 due = _choose_ticks(model, state, batch, group, due)
         chosen.append(due)
     return chosen
@@ -108,7 +89,7 @@ def _choose_ticks(
     required = [model.config.sensors[name].packets for name in looking]
     last_ns = group.rate.stamp_ns(group.rate.first_tick(model.duration_ns + 1) - 1)
     forced = [s == last_ns or any(clock.has_tick(s) for clock in required) for s in stamps_ns]
-    forced[0] |= not all(group.frames[name].watching for name in looking)
+    forced[0] |= not group.watching.issuperset(looking)
     slots = [batch.slot + place for place in due]
     places = group.rule.choose(state.trace.arrays.states, slots, stamps_ns, forced)
     batch.left_out_count += len(due) - len(places)
@@ -126,15 +107,10 @@ def pictures_due(group: RenderGroupState, stamp_ns: int, wanted: Collection[str]
     return [name for name, image in group.images.items() if name in wanted and image.rate.has_tick(stamp_ns)]
 
 
-def disable_frame_sensors(group: RenderGroupState, wanted: Collection[str]) -> None:
-    """Let frame sensors that are not wanted forget what they have seen."""
-    for name, sensor in group.frames.items():
-        sensor.watching = sensor.watching and name in wanted
-
-
-def plan_jobs(state: State, batch: Batch, chosen: Sequence[Sequence[int]]) -> Sequence[RenderJob]:
-    """Return what the groups render of a batch: at the boundaries chosen for each, if nothing is planned."""
+def plan_jobs(model: Model, state: State, batch: Batch) -> Sequence[RenderJob]:
+    """Return what the groups render of a batch; if nothing is planned yet, that is done."""
     if batch.jobs is None:
+        chosen = _choose(model, state, batch)
         batch.jobs = [plan_job(state, batch, index, places) for index, places in enumerate(chosen) if places]
     return batch.jobs
 
@@ -143,12 +119,12 @@ def plan_ahead(model: Model, state: State, batch: Batch) -> None:
     """Plan what is rendered of a batch that is going to be flown, unless that depends on the flight."""
     if model.schedule.sparse or any(group.frames for group in state.groups):
         return
-    plan_jobs(state, batch, choose(model, state, batch))
+    plan_jobs(model, state, batch)
 
 
 def plan_job(state: State, batch: Batch, index: int, places: Sequence[int]) -> RenderJob:
     """Return how a group renders some boundaries of a batch, at least one."""
-    group, buffer_index = state.groups[index], batch.number % len(state.batch_done)
+    group, buffer_index = state.groups[index], batch.number % state.pipeline.in_flight
     slots = tuple(batch.slot + place for place in places)
     stamps_ns = [batch.boundaries[place].stamp_ns for place in places]
     pictures = []
@@ -209,8 +185,8 @@ def launch_key(job: RenderJob) -> Hashable | None:
     return job.pattern, PinnedMapping.made_count, *addresses
 
 
-def render(job: RenderJob) -> tuple[Any, Any]:
-    """Launch the rendering of a job and the copies of its pictures; return what a graph of it must keep."""
+def pose_cameras(job: RenderJob) -> PictureViews:
+    """Launch the poses of camera and bodies at the instants of a job; return where they are."""
     group, buffers, instant_count = job.group, job.buffers, len(job.stamps_ns)
     p_WC, q_WC, stamps, bodies = buffers.p_WC, buffers.q_WC, buffers.stamps, buffers.bodies
     if buffers.chosen_slots is not None:
@@ -230,38 +206,74 @@ def render(job: RenderJob) -> tuple[Any, Any]:
 
     rows = instant_count * group.offsets_ns.shape[0] if group.world_count == 1 else stamps.shape[0]
     pose(group.offsets_ns, rows, p_WC=p_WC, q_WC=q_WC, stamps=stamps, bodies=bodies)
-    buffers.renderer.render(
-        p_WC, q_WC, job.to_slots, instant_count=instant_count, bodies=bodies, active=job.active
-    )
-    views = PictureViews(
+    return PictureViews(
         instant_count, job.to_slots, p_WC, q_WC, stamps, job.active, bodies, pose_at, find_twists
+    )
+
+
+def render(job: RenderJob, views: PictureViews) -> None:
+    """Launch the rendering of all instants of a job, and what sensors make of their pictures."""
+    group, buffers = job.group, job.buffers
+    buffers.renderer.render(
+        views.p_WC,
+        views.q_WC,
+        views.image_slot,
+        instant_count=views.instant_count,
+        bodies=views.bodies,
+        active=views.active,
     )
     for name in dict.fromkeys(name for _, _, name in job.pictures):
         if name in buffers.processes:
             buffers.processes[name].launch(views)
         if name in group.shared_pictures:
             wp.copy(group.pictures[name], group.shared_pictures[name])
+
+
+def fetch_pictures(job: RenderJob) -> None:
+    """Launch the copies of the pictures of a job to the host."""
+    group, buffers = job.group, job.buffers
     if group.allocate_picture is None:
         for source, copy in buffers.copies.items():
-            copy.fetch(0, instant_count if source in INSTANT_OUTPUTS else job.image_count)
-    else:
-        for stamp_ns, slot, name in job.pictures:
-            copy = buffers.copies[group.images[name].source]
-            buffer = job.picture_buffers.get((name, stamp_ns))
-            if buffer is None:
-                copy.fetch(slot, 1)
+            copy.fetch(0, len(job.stamps_ns) if source in INSTANT_OUTPUTS else job.image_count)
+        return
+    for stamp_ns, slot, name in job.pictures:
+        copy = buffers.copies[group.images[name].source]
+        buffer = job.picture_buffers.get((name, stamp_ns))
+        if buffer is None:
+            copy.fetch(slot, 1)
+        else:
+            copy.fetch_into(buffer, slot)
+
+
+def plan_scans(state: State, batch: Batch) -> list[Launches]:
+    """Return what the frame sensors that are wanted make of a batch.
+
+    Those that have no reference, and all where worlds begin, take the first frame as one.
+    """
+    jobs = {id(job.group): job for job in batch.jobs or ()}
+    scans: list[Launches | None] = []
+    for group in state.groups:
+        job = jobs.get(id(group))
+        buffers, stamps_ns = (group.buffers[0], []) if job is None else (job.buffers, job.stamps_ns)
+        for name, sensor in group.frames.items():
+            if name not in batch.wanted:
+                continue
+            frames = buffers.renderer.log_radiance
+            if stamps_ns and (batch.begins is not None or name not in group.watching):
+                mask = state.worlds.active if batch.begins is None else batch.begins
+                scans.append(Launches(None, partial(_begin, sensor, frames, stamps_ns, batch.until_ns, mask)))
+                group.watching.add(name)
             else:
-                copy.fetch_into(buffer, slot)
-    return job.from_slots, job.to_slots
+                scans.append(sensor.plan(frames, stamps_ns, batch.until_ns))
+    return [scan for scan in scans if scan is not None]
 
 
-def scan(state: State, batch: Batch) -> None:
-    """Let event cameras see what was rendered; that is the end of a batch on the device."""
-    with timed(state.wall_s, "events"):
-        for job in batch.jobs or ():
-            for name in job.frames:
-                job.group.frames[name].see(job.buffers.renderer.log_radiance, job.stamps_ns)
-        state.batch_done[batch.number % len(state.batch_done)].set()
+def _begin(sensor: FrameSensor, frames: Any, stamps_ns: Sequence[int], end_ns: int, mask: Any) -> None:
+    """Let a sensor take the first frame as its reference and, in one world, see those that follow."""
+    sensor.begin(frames, stamps_ns[0], mask)
+    scan = sensor.plan(frames[1:], stamps_ns[1:], end_ns) if len(stamps_ns) > 1 else None
+    if scan is not None:
+        scan.launch()
 
 
 def _is_all_in_place(batch: Batch) -> bool:
@@ -283,7 +295,7 @@ def read_cameras(
     jobs = batch.jobs or ()
     with timed(state.wall_s, "camera read-back"):
         if not (state.pictures_in_place and _is_all_in_place(batch)):
-            state.batch_done[batch.number % len(state.batch_done)].wait()
+            state.pipeline.wait(batch.number)
         readings = [
             job.group.frames[name].begin_read(job.stamps_ns, until_ns=batch.until_ns)
             for job in jobs
@@ -342,46 +354,3 @@ def _on_device(group: RenderGroupState, key: Hashable, slots: Callable[[], Any])
             del group.slots[next(iter(group.slots))]
         group.slots[key] = wp.array(np.array(slots(), dtype=np.int32), dtype=int, device=group.device)
     return group.slots[key]
-
-
-class WorldFrames(NamedTuple):
-    """The frames of a batch that the frame sensors of a group see in many worlds."""
-
-    group: RenderGroupState
-    offsets_ns: tuple[int, ...]
-    """From the end of the batch to the instant before it and to those within it [ns]."""
-    parity: int
-    """Which of the two states of the sensors is the present one."""
-
-
-def plan_world_frames(state: State, batch: Batch) -> list[WorldFrames]:
-    """Return what frame sensors see of a batch in many worlds; groups that do are in their other state then.
-
-    What they need on the device is allocated.
-    """
-    begin_ns, end_ns = batch.until_ns - sum(batch.elapsed_ns), batch.until_ns
-    found = []
-    for index, group in enumerate(state.groups):
-        seen = [b.stamp_ns - end_ns for b in batch.boundaries if index in b.groups]
-        if group.world_frames:
-            offsets_ns = (batch.last_seen_ns[index] + begin_ns - end_ns, *seen)
-            found.append(WorldFrames(group, offsets_ns, group.parity))
-            for sensor in group.world_frames.values():
-                sensor.offsets(offsets_ns)
-        if seen:
-            group.parity = 1 - group.parity
-    return found
-
-
-def find_in_worlds(state: State, frames: Sequence[WorldFrames]) -> list[object]:
-    """Let the frame sensors of many worlds see what was rendered; launches only.
-
-    The clocks of the worlds are at the end of the batch. What is returned has to be kept by a graph of these
-    launches.
-    """
-    held: list[object] = []
-    for group, offsets_ns, parity in frames:
-        for sensor in group.world_frames.values():
-            held.append(sensor.offsets(offsets_ns))
-            sensor.find(state.worlds.clock_ns, offsets_ns, parity)
-    return held

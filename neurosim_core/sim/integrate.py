@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import warp as wp
@@ -14,15 +14,14 @@ from neurosim_core.control import CommandMode, Controller
 from neurosim_core.control.setpoints import Setpoint
 from neurosim_core.frames import as_rows
 from neurosim_core.packets import Collision, Odometry, Packet
-from neurosim_core.runtime.cuda import use_stream
-from neurosim_core.runtime.timing import timed
+from neurosim_core.runtime.cuda import Launches
 from neurosim_core.sensors.state_sampler import sample_packet
 from neurosim_core.sim.inputs import CommandBuffer, as_device_array, check_rows
 from neurosim_core.sim.model import Model
-from neurosim_core.sim.schedule import Boundary
+from neurosim_core.sim.schedule import Boundary, Stretch
 from neurosim_core.sim.state import Batch, State
 from neurosim_core.sim.trace import BODY_RATE, ORIENTATION, POSITION, ROTOR_SPEED, VELOCITY, TraceRows
-from neurosim_core.vehicle import DynamicsError, Multirotor
+from neurosim_core.vehicle import DynamicsError
 from neurosim_core.vehicle.arrays import STATUS_COLLISION, check_status
 
 logger = logging.getLogger(__name__)
@@ -99,70 +98,48 @@ def _checked_command(model: Model, state: State, command: ArrayLike, mode: Comma
 
 
 def plan_batch(
-    state: State,
-    stretch: Sequence[Boundary],
-    *,
-    closed_loop: bool,
-    begin_ns: int | None = None,
-    last_seen_ns: Sequence[int] = (),
+    state: State, stretch: Stretch, *, closed_loop: bool, begin_ns: int | None = None, begins: Any = None
 ) -> Batch:
     """Return the batch that takes the vehicles through a stretch; nothing changes until it is launched.
 
     It begins at the end of what was launched, unless `begin_ns` says where. With `closed_loop` the path
-    controller commands; otherwise the last command is held. Of many worlds `last_seen_ns` is for each group
-    the instant before the stretch, from its begin [ns], <= 0.
+    controller commands; otherwise the last command is held. Worlds whose mask `begins` is not 0 begin with
+    it, device array of int32, shape [N].
     """
     closed_loop = closed_loop and state.path_controller is not None
     number, max_step_ns = state.launched_count, state.vehicle.max_step_ns
-    at_ns = state.launched_ns if begin_ns is None else begin_ns
-    elapsed_ns, pattern, step_count = [], [], 0
-    for boundary in stretch:
-        span_ns, at_ns = boundary.stamp_ns - at_ns, boundary.stamp_ns
-        elapsed_ns.append(span_ns)
-        pattern.append((span_ns, boundary.control, boundary.samplers))
-        step_count += -(-span_ns // max_step_ns)
+    begin_ns = state.launched_ns if begin_ns is None else begin_ns
+    slot_count = state.trace.arrays.states.shape[0] // state.pipeline.flown_ahead
     return Batch(
-        boundaries=stretch,
-        elapsed_ns=elapsed_ns,
-        pattern=tuple(pattern),
+        stretch=stretch,
+        boundaries=[Boundary(begin_ns + b[0], *b[1:]) for b in stretch.boundaries],
         closed_loop=closed_loop,
-        step_count=step_count,
-        command_count=sum(boundary.control for boundary in stretch) if closed_loop else 0,
+        step_count=sum(-(-span_ns // max_step_ns) for span_ns in stretch.elapsed_ns),
+        command_count=sum(boundary.control for boundary in stretch.boundaries) if closed_loop else 0,
         number=number,
-        slot=number % state.render_backlog * (state.trace.arrays.states.shape[0] // state.render_backlog),
+        slot=number % state.pipeline.flown_ahead * slot_count,
         wanted=state.wanted,
-        last_seen_ns=last_seen_ns,
-        until_ns=at_ns,
+        begins=begins,
+        until_ns=begin_ns + stretch.duration_ns,
     )
 
 
-def plan_flight(state: State, batch: Batch) -> tuple[Hashable, Callable[[], object]]:
-    """Take the vehicle through a batch: return what launches that, with its key.
+def take_command(state: State) -> Launches:
+    """Return what turns the command that was set into rotor speeds; it is taken with this.
 
     A controller may be replaced by another; a graph keeps the one that it was made with.
     """
     mode, state.command_mode = state.command_mode, None
     controller = None if mode is None else state.controllers.get(mode)
 
-    def flight() -> object:
+    def convert() -> object:
         if mode is not None and state.on_host:
             state.commands[mode].upload()
         if controller is not None:
             controller.update(state.vehicle.arrays)
-        integrate(state, batch)
-        _fetch(state, batch)
         return controller
 
-    state.launched_count += 1
-    state.launched_ns = batch.until_ns
-    return (mode, id(controller), batch.slot, batch.closed_loop, batch.pattern), flight
-
-
-def launch_flight(state: State, batch: Batch, key: Hashable, flight: Callable[[], object]) -> None:
-    """Launch a planned flight on its stream, and note its end."""
-    with timed(state.wall_s, "dynamics and control"), use_stream(state.flight_stream):
-        state.graphs.run(key, flight)
-        state.flown[batch.number % state.render_backlog].set()
+    return Launches((mode, id(controller)), convert)
 
 
 def integrate(state: State, batch: Batch) -> None:
@@ -171,15 +148,10 @@ def integrate(state: State, batch: Batch) -> None:
     samplers = list(state.samplers.values())
     taken = [batch.slot] * len(samplers)
     vehicle, trace, slot = state.vehicle, state.trace, batch.slot
-    for boundary, span_ns, count in _stretches(batch, joined=isinstance(vehicle, Multirotor)):
+    for boundary, span_ns, count in _spans(batch.stretch, joined=trace.joins_spans(vehicle)):
         end = slot + count
         record = {"first": slot == batch.slot, "last": end == batch.slot + len(batch.boundaries)}
-        if isinstance(vehicle, Multirotor) and span_ns > 0:
-            trace.fly(vehicle, slot, elapsed_ns, span_ns, count, **record)
-        else:
-            if span_ns > 0:
-                vehicle.advance(span_ns)
-            trace.record(slot, elapsed_ns + span_ns, **record)
+        trace.advance(vehicle, slot, elapsed_ns, span_ns, count, **record)
         slot, elapsed_ns = end, elapsed_ns + count * span_ns
         for index in boundary.samplers:
             samplers[index].measure(taken[index])
@@ -188,21 +160,21 @@ def integrate(state: State, batch: Batch) -> None:
             state.path_controller.update(vehicle.arrays)
 
 
-def _stretches(batch: Batch, *, joined: bool) -> Iterator[tuple[Boundary, int, int]]:
+def _spans(stretch: Stretch, *, joined: bool) -> Iterator[tuple[Boundary, int, int]]:
     """Yield spans between boundaries: the boundary at the end, the length [ns] and how many are `joined`.
 
     Those are joined that are equal, and between which nothing is due.
     """
     count = 0
-    following = [*batch.elapsed_ns[1:], -1]  # no span is that long: the last one is yielded, also one of 0
-    for boundary, span_ns, next_ns in zip(batch.boundaries, batch.elapsed_ns, following, strict=True):
+    following = [*stretch.elapsed_ns[1:], -1]  # no span is that long: the last one is yielded, also one of 0
+    for boundary, span_ns, next_ns in zip(stretch.boundaries, stretch.elapsed_ns, following, strict=True):
         count += 1
         if not joined or boundary.samplers or boundary.control or next_ns != span_ns:
             yield boundary, span_ns, count
             count = 0
 
 
-def _fetch(state: State, batch: Batch) -> None:
+def fetch_flight(state: State, batch: Batch) -> None:
     """Launch the copy of what was flown and sampled to the host."""
     state.trace.fetch(batch.slot, len(batch.boundaries))
     for index, copies in enumerate(state.sampler_copies.values()):

@@ -168,6 +168,9 @@ class KinematicVehicle:
         """Move all bodies on; launches only."""
         self._move.launch(self.count, [*self._motion, self._nobody, duration_ns, self.arrays])
 
+    def flight_kernel(self, record: Any) -> None:
+        """It is moved span by span."""
+
     def begin(self, mask: Any) -> None:
         """Put some bodies where their stamp says, device array of int32, shape [N]; launches only."""
         self._move.launch(self.count, [*self._motion, mask, 0, self.arrays], key="begin")

@@ -322,6 +322,7 @@ def _make_member(
             control=Rate(config.control.rate_hz),
             samplers=tuple(sampler.clock for sampler in samplers.values()),
             groups=tuple(group.rate for group in groups),
+            images={name: config.sensors[name].clock for group in groups for name in group.image_sensors},
             instants_per_launch=config.instants_per_launch,
             poses=_pose_clocks(config, groups),
             sparse=frozenset(i for i, group in enumerate(groups) if group.max_displacement_px is not None),

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from neurosim_core.sim.schedule import Period
+from neurosim_core.sim.schedule import Stretch
 from neurosim_core.sim.state import State
 from neurosim_core.vehicle.arrays import MultirotorArrays
 
@@ -51,12 +51,12 @@ class Observation:
         return self.frames
 
 
-def make_observation(state: State, period: Period) -> Observation:
-    """Return the views of what a period of many worlds yields."""
+def make_observation(state: State, stretch: Stretch) -> Observation:
+    """Return the views of what a stretch of many worlds yields."""
     arrays = state.vehicle.arrays
     samples = {}
     for index, (name, sampler) in enumerate(state.samplers.items()):
-        offsets_ns = period.sample_offsets_ns(index)
+        offsets_ns = stretch.sample_offsets_ns(index)
         samples[name] = Samples(
             arrays={field: _first(rows, len(offsets_ns)) for field, rows in sampler.arrays.items()},
             offsets_ns=offsets_ns,
@@ -64,9 +64,9 @@ def make_observation(state: State, period: Period) -> Observation:
     return Observation(
         state=arrays,
         clock_ns=state.worlds.clock_ns,
-        frames={name: s.results for group in state.groups for name, s in group.world_frames.items()},
+        frames={name: s.results for group in state.groups for name, s in group.frames.items()},
         images={name: picture for group in state.groups for name, picture in group.pictures.items()},
-        fresh=frozenset(name for names in period.pictures for name in names),
+        fresh=stretch.pictures,
         samples=samples,
         collided=state.worlds.collided,
         status=arrays.status,

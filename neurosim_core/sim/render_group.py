@@ -42,8 +42,6 @@ from neurosim_core.sensors.base import (
     PictureProcess,
     PictureSensorConfig,
     SensorConfig,
-    WorldFrameContext,
-    WorldFrameSensor,
 )
 from neurosim_core.sensors.render_plan import RenderGroup
 from neurosim_core.sim.model import Model
@@ -117,15 +115,13 @@ class RenderGroupState:
     buffers: Sequence[BatchBuffers] = ()
     """One for each batch in flight."""
     frames: dict[str, FrameSensor] = field(default_factory=dict)
-    """The frame sensors, where packets go to the host."""
-    world_frames: dict[str, WorldFrameSensor] = field(default_factory=dict)
-    """The frame sensors, where results stay on the device."""
+    """The frame sensors."""
+    watching: set[str] = field(default_factory=set)
+    """Frame sensors that have a reference, and saw every instant that was rendered since."""
     pictures: dict[str, Any] = field(default_factory=dict)
     """The last picture of each image sensor, where they stay on the device: arrays [N, H, W, ...]."""
     shared_pictures: dict[str, Any] = field(default_factory=dict)
     """Pictures of the renderer, for image sensors whose last picture another one of the group replaces."""
-    parity: int = 0
-    """Which of the two states of `world_frames` is the present one."""
     p_BC: Any
     """Position of the camera on the body in each world [m], vec3d, shape [N]."""
     q_BC: Any
@@ -153,14 +149,16 @@ def make_render_groups(
     *,
     seeds: Any,
     history: Any,
+    clock_ns: Any,
     in_flight: int,
     on_host: bool,
     allocate_picture: PictureAllocator | None,
 ) -> list[RenderGroupState]:
     """Allocate the buffers of all groups; there are none where the scene is not on the device.
 
-    Seeds are those of each world, device array of uint64; the history is for sensors that look back. With
-    `on_host` pictures and events become packets, and `allocate_picture` may give memory to copy a picture to.
+    Seeds are those of each world, device array of uint64; the history is for sensors that look back, and the
+    clock that of each world. With `on_host` pictures and events become packets, and `allocate_picture` may
+    give memory to copy a picture to.
 
     Raises:
         ValueError: The renderer cannot say what moves how far, and a group is adaptive; or a picture, or an
@@ -176,7 +174,7 @@ def make_render_groups(
         capacity = model.schedule.ticks_per_batch(index) if on_host else worlds.instant_count
         sensors = {name: model.config.sensors[name] for name in plan.frame_sensors}
         frames = {name: sensor for name, sensor in sensors.items() if isinstance(sensor, FrameSensorConfig)}
-        event_capacities = {  # checked before anything is allocated
+        capacities = {  # checked before anything is allocated
             name: 0 if on_host else sensor.world_capacity(len(worlds.seeds), worlds.event_capacity)
             for name, sensor in frames.items()
         }
@@ -184,12 +182,31 @@ def make_render_groups(
         group.buffers = [
             _make_buffers(group, model, worlds, seeds, on_host=on_host) for _ in range(in_flight)
         ]
-        if on_host:
-            seed = worlds.seeds[0]
-            group.frames = _make_frames(group, model, frames, history, in_flight=in_flight, seed=seed)
-        else:
+        if not on_host:
             group.pictures, group.shared_pictures = _picture_arrays(group)
-            group.world_frames = _make_world_frames(group, frames, worlds, event_capacities)
+        group.frames = {
+            name: sensor.make(
+                FrameContext(
+                    name=name,
+                    configs=[rig[name] for rig in worlds.rigs],
+                    lens=plan.lens,
+                    device=model.device,
+                    on_host=on_host,
+                    in_flight=in_flight,
+                    instant_count=capacity,
+                    capacity=capacities[name],
+                    ordered=worlds.ordered,
+                    seeds=worlds.seeds,
+                    clock_ns=clock_ns,
+                    scene=model.scene_on_device,
+                    motions=group.motions,
+                    history=history,
+                    p_BC=wp.vec3d(*plan.mount.position_m),
+                    q_BC=wp.quatd(*plan.mount.optical_quaternion()),
+                )
+            )
+            for name, sensor in frames.items()
+        }
         groups.append(group)
     return groups
 
@@ -230,59 +247,6 @@ def _make_group(
         only_launches=model.config.renderer.only_launches,
         allocate_picture=allocate_picture,
     )
-
-
-def _make_frames(
-    group: RenderGroupState,
-    model: Model,
-    sensors: Mapping[str, FrameSensorConfig],
-    history: Any,
-    *,
-    in_flight: int,
-    seed: int,
-) -> dict[str, FrameSensor]:
-    """Return the frame sensors of one world whose packets go to the host."""
-    lens, mount = group.plan.lens, group.plan.mount
-    return {
-        name: sensor.make(
-            FrameContext(
-                name=name,
-                lens=lens,
-                device=group.device,
-                in_flight=in_flight,
-                seed=seed,
-                scene=model.scene_on_device,
-                motions=group.motions,
-                history=history,
-                p_BC=wp.vec3d(*mount.position_m),
-                q_BC=wp.quatd(*mount.optical_quaternion()),
-            )
-        )
-        for name, sensor in sensors.items()
-    }
-
-
-def _make_world_frames(
-    group: RenderGroupState,
-    sensors: Mapping[str, FrameSensorConfig],
-    worlds: WorldSettings,
-    event_capacities: Mapping[str, int],
-) -> dict[str, WorldFrameSensor]:
-    """Return the frame sensors of many worlds, which read log radiance [N, K, H W]."""
-    seen: Any = group.buffers[0].renderer.log_radiance
-    return {
-        name: sensor.make_worlds(
-            WorldFrameContext(
-                name=name,
-                configs=[rig[name] for rig in worlds.rigs],
-                frames=seen.reshape((group.world_count, group.capacity, seen.shape[1] * seen.shape[2])),
-                capacity=event_capacities[name],
-                seeds=worlds.seeds,
-                ordered=worlds.ordered,
-            )
-        )
-        for name, sensor in sensors.items()
-    }
 
 
 def _make_buffers(

@@ -11,7 +11,7 @@ flies one and leaves the cameras to another thread, which calls `render_batch` o
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
@@ -21,9 +21,7 @@ from neurosim_core.packets import Odometry, Packet
 from neurosim_core.runtime.timing import timed
 from neurosim_core.sim.cameras import (
     acquire_picture_buffers,
-    disable_frame_sensors,
     is_due,
-    launch_cameras,
     pictures_due,
     plan_ahead,
     read_cameras,
@@ -31,16 +29,14 @@ from neurosim_core.sim.cameras import (
 from neurosim_core.sim.integrate import (
     Command,
     in_order,
-    launch_flight,
     plan_batch,
-    plan_flight,
     read_flight,
     set_command,
 )
 from neurosim_core.sim.model import Model, make_model
-from neurosim_core.sim.schedule import Boundary, batch_end_ns, boundaries, everything
+from neurosim_core.sim.schedule import Stretch
 from neurosim_core.sim.state import Batch, State, make_state
-from neurosim_core.sim.step import launch, read
+from neurosim_core.sim.step import launch, launch_cameras, launch_flight, read
 from neurosim_core.vehicle.arrays import read_state
 
 
@@ -67,14 +63,15 @@ def run_model(model: Model, state: State) -> Iterator[Packet]:
         yield from start(model, state)
 
     def launch_ahead() -> None:
-        while len(state.in_flight) < len(state.batch_done) and state.launched_ns < model.duration_ns:
-            launch_until(model, state, batch_end_ns(model.schedule, state.launched_ns, model.duration_ns))
+        while len(state.in_flight) < state.pipeline.in_flight and state.launched_ns < model.duration_ns:
+            end_ns = model.schedule.batch_end_ns(state.launched_ns, model.duration_ns)
+            launch_until(model, state, end_ns)
 
     while not state.ended:
         launch_ahead()
         if not state.in_flight:
             break
-        yield from read(model, state, meanwhile=launch_ahead if len(state.batch_done) > 1 else None)
+        yield from read(model, state, meanwhile=launch_ahead if state.pipeline.in_flight > 1 else None)
         if state.failure is not None:
             raise state.failure
     yield from finish(state)
@@ -138,7 +135,7 @@ def begin_step(
     batch, state.planned = state.planned, None
     if batch is None or (batch.number, batch.wanted) != (state.launched_count, state.wanted):
         batch = _plan_period(model, state)
-    end_ns = _period_end_ns(model, state)
+    end_ns = model.schedule.period_end_ns(state.launched_ns)
     launch(model, state, batch)
     return PendingStep(packets, end_ns)
 
@@ -163,8 +160,7 @@ def acquire_next_picture_buffers(state: State) -> None:
 
 def settle(state: State) -> None:
     """Wait until the device has written all pictures that were handed out (see `allocate_picture`)."""
-    for done in state.batch_done:
-        done.wait()
+    state.pipeline.wait_all()
 
 
 def end_step(model: Model, state: State, pending: PendingStep) -> list[Packet]:
@@ -177,7 +173,7 @@ def end_step(model: Model, state: State, pending: PendingStep) -> list[Packet]:
     """
     packets = pending.packets + read(model, state, last=state.launched_ns >= pending.end_ns)
     while state.launched_ns < pending.end_ns and not (state.ended or state.failure is not None):
-        part_ns = batch_end_ns(model.schedule, state.launched_ns, pending.end_ns)
+        part_ns = model.schedule.batch_end_ns(state.launched_ns, pending.end_ns)
         launch_until(model, state, part_ns, closed_loop=False)
         packets += read(model, state, last=part_ns >= pending.end_ns)
     return packets
@@ -197,7 +193,7 @@ def warm_flight(model: Model, *_: object) -> None:
     state = make_state(model, in_flight=1)
     start(model, state)
     state.wanted = frozenset()
-    advance(model, state, batch_end_ns(model.schedule, 0, _period_end_ns(model, state)))
+    advance(model, state, model.schedule.batch_end_ns(0, model.schedule.period_end_ns(0)))
 
 
 def integrate_period(
@@ -219,23 +215,24 @@ def integrate_period(
     packets: list[Packet] = []
     batches: list[Batch] = []
 
-    def fly(stretch: Sequence[Boundary]) -> None:
+    def fly(stretch: Stretch) -> None:
         if render_backlog_left(state) < 1:
             raise RuntimeError(
-                f"{state.render_backlog} batches wait for render_batch() or skip_batch(), and no more may"
+                f"{state.pipeline.flown_ahead} batches wait for render_batch() or skip_batch(), "
+                "and no more may"
             )
         batch = plan_batch(state, stretch, closed_loop=False)
-        launch_flight(state, batch, *plan_flight(state, batch))
+        launch_flight(state, batch)
         batches.append(batch)
         with timed(state.wall_s, "read-back"):
-            state.flown[batch.number % state.render_backlog].wait()
+            state.pipeline.wait_flown(batch.number)
             packets.extend(in_order(model, read_flight(model, state, batch), state.stamp_ns))
 
     if state.launched_count == 0:
-        fly([everything(model.schedule)])
+        fly(model.schedule.first())
     set_command(model, state, command, mode)
     for end_ns in _parts_of_period(model, state):
-        fly(boundaries(model.schedule, state.launched_ns, end_ns))
+        fly(model.schedule.stretch(state.launched_ns, end_ns))
         if state.ended or state.failure is not None:
             break
     return packets, batches
@@ -243,7 +240,7 @@ def integrate_period(
 
 def render_backlog_left(state: State) -> int:
     """Return how many batches `integrate_period` can fly before one of those that wait was looked at."""
-    return state.render_backlog - (state.launched_count - state.rendered_count)
+    return state.pipeline.flown_ahead - (state.launched_count - state.rendered_count)
 
 
 def render_batch(model: Model, state: State, batch: Batch) -> list[Packet]:
@@ -271,7 +268,7 @@ def skip_batch(model: Model, state: State, batch: Batch) -> int:
     """
     count = 0
     for index, group in enumerate(state.groups):
-        disable_frame_sensors(group, batch.wanted)
+        group.watching &= batch.wanted
         stamps = [b.stamp_ns for b in batch.boundaries if index in b.groups]
         for stamp_ns in stamps:
             count += is_due(group, stamp_ns, batch.wanted)
@@ -316,12 +313,12 @@ def start(model: Model, state: State) -> list[Packet]:
         model: What does not change.
         state: As `make_state` returns it: nothing has been launched.
     """
-    launch(model, state, plan_batch(state, [everything(model.schedule)], closed_loop=True))
+    launch(model, state, plan_batch(state, model.schedule.first(), closed_loop=True))
     return read(model, state)
 
 
 def advance(model: Model, state: State, end_ns: int) -> list[Packet]:
-    """Fly one batch, at most to what `batch_end_ns` gives, and return what the sensors yield in it.
+    """Fly one batch, at most to what `Schedule.batch_end_ns` gives, and return what the sensors yield in it.
 
     The path controller commands.
 
@@ -348,13 +345,15 @@ def launch_until(model: Model, state: State, end_ns: int, *, closed_loop: bool =
         end_ns: End of the batch [ns], after what was launched before.
         closed_loop: The path controller commands; otherwise the last command is held.
     """
-    stretch = boundaries(model.schedule, state.launched_ns, end_ns)
+    stretch = model.schedule.stretch(state.launched_ns, end_ns)
     launch(model, state, plan_batch(state, stretch, closed_loop=closed_loop))
 
 
 def finish(state: State) -> list[Packet]:
     """Return the packets whose windows have begun and not ended; for the end of a run."""
-    sensors = [sensor for group in state.groups for sensor in group.frames.values()]
+    sensors = [
+        group.frames[name] for group in state.groups for name in group.frames if name in group.watching
+    ]
     return [packet for sensor in sensors for packet in sensor.flush(until_ns=state.stamp_ns)]
 
 
@@ -367,18 +366,12 @@ def _check_all_read(state: State) -> None:
 
 def _parts_of_period(model: Model, state: State) -> Iterator[int]:
     """Yield the ends of the batches that a control period is cut into, each when the one before was flown."""
-    end_ns = _period_end_ns(model, state)
+    end_ns = model.schedule.period_end_ns(state.launched_ns)
     while state.launched_ns < end_ns:
-        yield batch_end_ns(model.schedule, state.launched_ns, end_ns)
+        yield model.schedule.batch_end_ns(state.launched_ns, end_ns)
 
 
 def _plan_period(model: Model, state: State) -> Batch:
     """Plan the first batch of the next control period."""
-    end_ns = next(_parts_of_period(model, state))
-    return plan_batch(state, boundaries(model.schedule, state.launched_ns, end_ns), closed_loop=False)
-
-
-def _period_end_ns(model: Model, state: State) -> int:
-    """Return the next tick of the control clock after what was launched [ns]."""
-    control = model.schedule.control
-    return control.stamp_ns(control.first_tick(state.launched_ns + 1))
+    stretch = model.schedule.stretch(state.launched_ns, next(_parts_of_period(model, state)))
+    return plan_batch(state, stretch, closed_loop=False)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
-from dataclasses import dataclass
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -12,35 +14,9 @@ from neurosim_core.clock import Rate
 
 TICKS_PER_INSTANT = 4
 """How many times as many ticks a batch takes of a group that renders only some of them."""
-PERIOD_COUNT_MAX = 4096
-"""Most periods that are remembered; where clocks hardly ever tick together, no two are alike."""
+STRETCH_COUNT_MAX = 4096
+"""Most stretches that are remembered; where clocks hardly ever tick together, no two are alike."""
 _COMMON_MAX_NS = 10**13
-
-
-@dataclass(frozen=True, kw_only=True)
-class Schedule:
-    """Every clock of a run."""
-
-    control: Rate
-    samplers: tuple[Rate, ...]
-    """Clocks of the sensors that read the state of the vehicle (IMU, odometry)."""
-    groups: tuple[Rate, ...]
-    """Clocks of the groups."""
-    instants_per_launch: int
-    """The most instants of one group in one batch; of a sparse group, times TICKS_PER_INSTANT."""
-    sparse: frozenset[int] = frozenset()
-    """Indices of the groups that render only some of their ticks."""
-    poses: tuple[Rate, ...] = ()
-    """Clocks at which nothing is due but the pose is recorded, for rays with times of their own."""
-
-    @property
-    def clocks(self) -> tuple[Rate, ...]:
-        """All of them."""
-        return (self.control, *self.samplers, *self.groups, *self.poses)
-
-    def ticks_per_batch(self, group: int) -> int:
-        """Return the most ticks of a group in one batch."""
-        return self.instants_per_launch * (TICKS_PER_INSTANT if group in self.sparse else 1)
 
 
 class Boundary(NamedTuple):
@@ -55,36 +31,130 @@ class Boundary(NamedTuple):
     """Indices of the groups that see this instant."""
 
 
-def batch_end_ns(schedule: Schedule, start_ns: int, limit_ns: int) -> int:
-    """Return where the batch that follows `start_ns` ends: at most at `limit_ns`.
+@dataclass(frozen=True, kw_only=True)
+class Stretch:
+    """What happens in a stretch of a run, relative to its begin: the same launches fly equal stretches."""
 
-    It ends where the first of the groups has as many ticks as one launch takes; a rig without cameras counts
-    commands instead.
-    """
-    rates = schedule.groups or (schedule.control,)
-    ends = (_tick_after(rate, start_ns, schedule.ticks_per_batch(group)) for group, rate in enumerate(rates))
-    return min([limit_ns, *ends])
+    boundaries: tuple[Boundary, ...]
+    """Stamps are relative to the begin of the stretch."""
+    pictures: frozenset[str]
+    """Image sensors that take a picture at the end of the stretch."""
+
+    @property
+    def duration_ns(self) -> int:
+        """Length of the stretch [ns]."""
+        return self.boundaries[-1].stamp_ns
+
+    @functools.cached_property
+    def elapsed_ns(self) -> tuple[int, ...]:
+        """From each boundary's predecessor to it [ns]."""
+        return tuple(b - a for a, b in itertools.pairwise([0, *(b.stamp_ns for b in self.boundaries)]))
+
+    @functools.cached_property
+    def flight(self) -> Hashable:
+        """What of it the flight depends on: spans, and what is due at their ends."""
+        return tuple(
+            (span, b.control, b.samplers) for span, b in zip(self.elapsed_ns, self.boundaries, strict=True)
+        )
+
+    def sample_offsets_ns(self, sampler: int) -> tuple[int, ...]:
+        """Return when a sampler reads the state [ns]."""
+        return tuple(b.stamp_ns for b in self.boundaries if sampler in b.samplers)
 
 
-def boundaries(schedule: Schedule, start_ns: int, end_ns: int) -> list[Boundary]:
-    """Return the boundaries in (start_ns, end_ns] in order of time; the last is always at `end_ns`."""
-    marks = {end_ns: 0}
-    for place, rate in enumerate(schedule.clocks):
-        mark = 1 << place
-        for stamp_ns in rate.stamps(start_ns + 1, end_ns + 1):
-            marks[stamp_ns] = marks.get(stamp_ns, 0) | mark
-    sampler_count, group_count = len(schedule.samplers), len(schedule.groups)
-    return [
-        Boundary(stamp_ns, *_due(marks[stamp_ns], sampler_count, group_count)) for stamp_ns in sorted(marks)
-    ]
+@dataclass(frozen=True, kw_only=True)
+class Schedule:
+    """Every clock of a run."""
 
+    control: Rate
+    samplers: tuple[Rate, ...]
+    """Clocks of the sensors that read the state of the vehicle (IMU, odometry)."""
+    groups: tuple[Rate, ...]
+    """Clocks of the groups."""
+    instants_per_launch: int
+    """The most instants of one group in one batch; of a sparse group, times TICKS_PER_INSTANT."""
+    images: Mapping[str, Rate] = field(default_factory=dict)
+    """Clocks of the image sensors, by name: each one's ticks are ticks of its group."""
+    sparse: frozenset[int] = frozenset()
+    """Indices of the groups that render only some of their ticks."""
+    poses: tuple[Rate, ...] = ()
+    """Clocks at which nothing is due but the pose is recorded, for rays with times of their own."""
+    _stretches: dict[tuple[int, int], Stretch] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
-def boundary_count_max(schedule: Schedule, span_s: float | None = None) -> int:
-    """Return a bound on the number of boundaries in any stretch of a length [s]; None: in any batch."""
-    if span_s is None:
-        shortest = schedule.groups or (schedule.control,)
-        span_s = min(schedule.ticks_per_batch(group) / rate.rate_hz for group, rate in enumerate(shortest))
-    return sum(int(span_s * rate.rate_hz) + 2 for rate in schedule.clocks) + 1
+    @functools.cached_property
+    def clocks(self) -> tuple[Rate, ...]:
+        """Those at whose ticks the integration stops."""
+        return (self.control, *self.samplers, *self.groups, *self.poses)
+
+    @functools.cached_property
+    def common_ns(self) -> int:
+        """All clocks tick together after so long [ns]; 0: that takes hours."""
+        return _common_period_ns([*self.clocks, *self.images.values()])
+
+    def ticks_per_batch(self, group: int) -> int:
+        """Return the most ticks of a group in one batch."""
+        return self.instants_per_launch * (TICKS_PER_INSTANT if group in self.sparse else 1)
+
+    def batch_end_ns(self, start_ns: int, limit_ns: int) -> int:
+        """Return where the batch that follows `start_ns` ends: at most at `limit_ns`.
+
+        It ends where the first of the groups has as many ticks as one launch takes; a rig without cameras
+        counts commands instead.
+        """
+        rates = self.groups or (self.control,)
+        ends = (_tick_after(rate, start_ns, self.ticks_per_batch(group)) for group, rate in enumerate(rates))
+        return min([limit_ns, *ends])
+
+    def period_end_ns(self, start_ns: int) -> int:
+        """Return the next tick of the control clock after a stamp [ns]."""
+        return _tick_after(self.control, start_ns, 1)
+
+    def first(self) -> Stretch:
+        """Return what happens at stamp 0: everything."""
+        everything = Boundary(
+            stamp_ns=0,
+            control=True,
+            samplers=tuple(range(len(self.samplers))),
+            groups=tuple(range(len(self.groups))),
+        )
+        return Stretch(boundaries=(everything,), pictures=frozenset(self.images))
+
+    def stretch(self, start_ns: int, end_ns: int) -> Stretch:
+        """Return what happens in (start_ns, end_ns], in order of time; the last boundary is at `end_ns`."""
+        key = (start_ns % self.common_ns if self.common_ns else start_ns, end_ns - start_ns)
+        if key not in self._stretches:
+            if len(self._stretches) >= STRETCH_COUNT_MAX:
+                self._stretches.clear()
+            self._stretches[key] = self._make_stretch(start_ns, end_ns)
+        return self._stretches[key]
+
+    def _make_stretch(self, start_ns: int, end_ns: int) -> Stretch:
+        marks = {end_ns: 0}
+        for place, rate in enumerate(self.clocks):
+            mark = 1 << place
+            for stamp_ns in rate.stamps(start_ns + 1, end_ns + 1):
+                marks[stamp_ns] = marks.get(stamp_ns, 0) | mark
+        sampler_count, group_count = len(self.samplers), len(self.groups)
+        return Stretch(
+            boundaries=tuple(
+                Boundary(stamp_ns - start_ns, *_due(marks[stamp_ns], sampler_count, group_count))
+                for stamp_ns in sorted(marks)
+            ),
+            pictures=frozenset(name for name, rate in self.images.items() if rate.has_tick(end_ns)),
+        )
+
+    def boundary_count_max(self, span_s: float | None = None) -> int:
+        """Return a bound on the boundaries in any stretch of a length [s]; None: in any batch."""
+        if span_s is None:
+            shortest = self.groups or (self.control,)
+            span_s = min(self.ticks_per_batch(group) / rate.rate_hz for group, rate in enumerate(shortest))
+        return sum(int(span_s * rate.rate_hz) + 2 for rate in self.clocks) + 1
+
+    def instants_per_period(self) -> int:
+        """Return the most instants of any group in a control period, at least 1."""
+        return max((rate.ticks_within(self.control) for rate in self.groups), default=1) or 1
 
 
 def _tick_after(rate: Rate, stamp_ns: int, count: int) -> int:
@@ -98,97 +168,6 @@ def _due(mark: int, sampler_count: int, group_count: int) -> tuple[bool, tuple[i
     samplers = tuple(index for index in range(sampler_count) if mark >> (1 + index) & 1)
     groups = tuple(index for index in range(group_count) if mark >> (1 + sampler_count + index) & 1)
     return bool(mark & 1), samplers, groups
-
-
-@dataclass(frozen=True, kw_only=True)
-class Period:
-    """A control period, relative to its begin. The same launches fly periods that are equal."""
-
-    boundaries: tuple[Boundary, ...]
-    """Stamps are relative to the begin of the period."""
-    last_seen_ns: tuple[int, ...]
-    """For each group, from the begin of the period to the last instant before it, <= 0 [ns]."""
-    pictures: tuple[tuple[str, ...], ...]
-    """For each group, the image sensors that take a picture, at the end of the period."""
-
-    @property
-    def duration_ns(self) -> int:
-        """Length of the period [ns]."""
-        return self.boundaries[-1].stamp_ns
-
-    def offsets_ns(self, group: int) -> tuple[int, ...]:
-        """Return when a group sees: the last instant before the period (<= 0), then its own [ns]."""
-        return (self.last_seen_ns[group], *(b.stamp_ns for b in self.boundaries if group in b.groups))
-
-    def sample_offsets_ns(self, sampler: int) -> tuple[int, ...]:
-        """Return when a sampler reads the state [ns]."""
-        return tuple(b.stamp_ns for b in self.boundaries if sampler in b.samplers)
-
-
-class Timetable:
-    """Finds the period that begins at a tick of the control clock.
-
-    All clocks tick together after `common_ns`; 0: that takes hours.
-    """
-
-    def __init__(self, schedule: Schedule, images: tuple[dict[str, Rate], ...]) -> None:
-        """Make it for a rig, and for each group the clocks of its image sensors by name."""
-        self._schedule = schedule
-        self._images = images
-        self._periods: dict[int, Period] = {}
-        rates = [rate for cameras in images for rate in cameras.values()]
-        self.common_ns = _common_period_ns([*schedule.clocks, *rates])
-
-    def at(self, begin_ns: int) -> Period:
-        """Return the period that begins at a tick of the control clock."""
-        key = begin_ns % self.common_ns if self.common_ns else begin_ns
-        if key not in self._periods:
-            if len(self._periods) >= PERIOD_COUNT_MAX:
-                self._periods.clear()
-            self._periods[key] = self._make(begin_ns)
-        return self._periods[key]
-
-    def first(self) -> Period:
-        """Return what happens at stamp 0: everything."""
-        return Period(
-            boundaries=(everything(self._schedule),),
-            last_seen_ns=tuple(0 for _ in self._schedule.groups),
-            pictures=tuple(tuple(cameras) for cameras in self._images),
-        )
-
-    def instant_count_max(self) -> int:
-        """Return the most instants of any group in a period, at least 1."""
-        control = self._schedule.control
-        return max((rate.ticks_within(control) for rate in self._schedule.groups), default=1) or 1
-
-    def boundary_count_max(self) -> int:
-        """Return a bound on the number of boundaries in a period."""
-        return boundary_count_max(self._schedule, 1.0 / self._schedule.control.rate_hz)
-
-    def _make(self, begin_ns: int) -> Period:
-        control = self._schedule.control
-        end_ns = control.stamp_ns(control.first_tick(begin_ns + 1))
-        stops = boundaries(self._schedule, begin_ns, end_ns)
-        return Period(
-            boundaries=tuple(stop._replace(stamp_ns=stop.stamp_ns - begin_ns) for stop in stops),
-            last_seen_ns=tuple(
-                rate.stamp_ns(rate.first_tick(begin_ns + 1) - 1) - begin_ns for rate in self._schedule.groups
-            ),
-            pictures=tuple(
-                tuple(name for name, clock in cameras.items() if clock.has_tick(end_ns))
-                for cameras in self._images
-            ),
-        )
-
-
-def everything(schedule: Schedule) -> Boundary:
-    """Return the boundary at stamp 0, where all sensors sample."""
-    return Boundary(
-        stamp_ns=0,
-        control=True,
-        samplers=tuple(range(len(schedule.samplers))),
-        groups=tuple(range(len(schedule.groups))),
-    )
 
 
 def _common_period_ns(rates: list[Rate]) -> int:

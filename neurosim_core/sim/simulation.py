@@ -17,7 +17,6 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from neurosim_core.clock import Rate
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.control import CommandMode
 from neurosim_core.render.camera import Lens
@@ -35,9 +34,9 @@ from neurosim_core.sim.model import Model
 from neurosim_core.sim.observation import Observation, make_observation
 from neurosim_core.sim.parameters import WorldSettings, check_lenses, lenses_differ, vary_sensors
 from neurosim_core.sim.scene_table import SceneSource, make_scene_table
-from neurosim_core.sim.schedule import PERIOD_COUNT_MAX, Period, Timetable
-from neurosim_core.sim.state import State, make_state, reset_vehicles
-from neurosim_core.sim.step import launch, launch_first
+from neurosim_core.sim.schedule import STRETCH_COUNT_MAX, Schedule, Stretch
+from neurosim_core.sim.state import make_state, reset_vehicles
+from neurosim_core.sim.step import launch
 from neurosim_core.trajectory.feasibility import GRAVITY_M_S2
 
 _logger = logging.getLogger(__name__)
@@ -119,9 +118,8 @@ class Simulation:
         )
         self._model = model = self._scenes.model
         self.device = wp.get_device(model.device)
-        images = tuple({n: chosen.sensors[n].clock for n in g.image_sensors} for g in model.groups)
-        _check_image_rates(images, model.schedule.control)
-        self._timetable = Timetable(model.schedule, images)
+        self._schedule = model.schedule
+        _check_image_rates(self._schedule)
         self._state = make_state(
             model,
             worlds=WorldSettings(
@@ -129,8 +127,8 @@ class Simulation:
                 seeds=first_seeds,
                 rigs=rigs,
                 lenses=lenses or {},
-                instant_count=self._timetable.instant_count_max(),
-                slot_count=self._timetable.boundary_count_max(),
+                instant_count=self._schedule.instants_per_period(),
+                slot_count=self._schedule.boundary_count_max(1.0 / self._schedule.control.rate_hz),
                 event_capacity=event_capacity,
                 ordered=sorted,
             ),
@@ -138,7 +136,7 @@ class Simulation:
         self._mask = wp.ones(worlds, dtype=wp.int32, device=self.device)
         self._begin = {name: wp.clone(getattr(self._state.start, name)) for name in Start.vars}
         self._warned = False
-        self._observations: dict[Period, Observation] = {}
+        self._observations: dict[Stretch, Observation] = {}
         self._now_ns: int | None = None
         self.duration_ns = 0
 
@@ -161,8 +159,8 @@ class Simulation:
             ValueError: There is no such event camera, or its pixels are not ideal.
         """
         for group in self._state.groups:
-            if camera in group.world_frames:
-                thresholds = getattr(group.world_frames[camera], "thresholds", None)
+            if camera in group.frames:
+                thresholds = getattr(group.frames[camera], "thresholds", None)
                 if thresholds is not None:
                     return thresholds
         raise ValueError(f"{camera!r} is no event camera with ideal pixels: its thresholds stay as they are")
@@ -244,7 +242,7 @@ class Simulation:
     @property
     def common_ns(self) -> int:
         """Some worlds can be reset when all of them have flown for a multiple of this [ns]; 0: never."""
-        return self._timetable.common_ns
+        return self._schedule.common_ns
 
     def reset(
         self,
@@ -290,7 +288,7 @@ class Simulation:
             self._check_partial()
         seeds = None if seed is None else checked_seeds(seed, self.count, self.device)
         chosen = None if mask is None else checked_mask(mask, self.count, self.device)
-        state, period = self._state, self._timetable.first()
+        state, first = self._state, self._schedule.first()
         begin = {
             name: self._begin[name] if value is None else checked_rows(value, self._begin[name], name)
             for name, value in given.items()
@@ -305,13 +303,16 @@ class Simulation:
             wp.copy(getattr(state.start, name), rows)
         reset_vehicles(self._model, state, self._mask)
         wp.copy(state.worlds.active, self._mask)  # sensors of the others do not see this
-        now_ns = state.launched_ns
-        self._launch_reset(state, period)
-        state.launched_ns = 0 if mask is None else now_ns
-        if mask is None:
-            self._now_ns = 0
+        now_ns = 0 if mask is None else self._require_reset()
+        launch(
+            self._model,
+            state,
+            plan_batch(state, first, closed_loop=False, begin_ns=now_ns, begins=self._mask),
+        )
+        state.worlds.active.fill_(1)
+        self._now_ns = now_ns
         self.duration_ns = 0
-        return self._observe(period)
+        return self._observe(first)
 
     def step(self, commands: Any = None, mode: CommandMode = "rates") -> Observation:
         """Hold a command in each world until the next tick of the control clock.
@@ -366,17 +367,12 @@ class Simulation:
 
     def _advance(self, *, closed_loop: bool) -> Observation:
         """Fly one control period."""
-        now_ns = self._require_reset()
-        period = self._timetable.at(now_ns)
-        state = self._state
-        stretch = [b._replace(stamp_ns=b.stamp_ns + now_ns) for b in period.boundaries]
-        batch = plan_batch(
-            state, stretch, closed_loop=closed_loop, begin_ns=now_ns, last_seen_ns=period.last_seen_ns
-        )
-        launch(self._model, state, batch)
-        self._now_ns = now_ns + period.duration_ns
-        self.duration_ns = period.duration_ns
-        if state.graphs.dropped_count > 0 and not self._warned:
+        now_ns, state = self._require_reset(), self._state
+        stretch = self._schedule.stretch(now_ns, self._schedule.period_end_ns(now_ns))
+        launch(self._model, state, plan_batch(state, stretch, closed_loop=closed_loop, begin_ns=now_ns))
+        self.duration_ns = stretch.duration_ns
+        self._now_ns = now_ns + stretch.duration_ns
+        if state.pipeline.graphs.dropped_count > 0 and not self._warned:
             self._warned = True
             _logger.warning(
                 "steps of these worlds come in more patterns than there is room for graphs, and are launched "
@@ -384,29 +380,20 @@ class Simulation:
                 "control.rate_hz = %g or multiples of it",
                 self._model.config.control.rate_hz,
             )
-        return self._observe(period)
+        return self._observe(stretch)
 
-    def _launch_reset(self, state: State, period: Period) -> None:
-        """Sample all sensors at stamp 0 in the worlds of the mask."""
-        batch = plan_batch(state, period.boundaries, closed_loop=False, begin_ns=0)
-        launch_first(self._model, state, batch)
-        for group in state.groups:
-            for sensor in group.world_frames.values():
-                sensor.begin(self._mask, group.parity)
-        state.worlds.active.fill_(1)
-
-    def _observe(self, period: Period) -> Observation:
-        """Return the views of what a period yields: the same arrays each time."""
-        if period not in self._observations:
-            if len(self._observations) >= PERIOD_COUNT_MAX:
+    def _observe(self, stretch: Stretch) -> Observation:
+        """Return the views of what a stretch yields: the same arrays each time."""
+        if stretch not in self._observations:
+            if len(self._observations) >= STRETCH_COUNT_MAX:
                 self._observations.clear()
-            self._observations[period] = make_observation(self._state, period)
-        return self._observations[period]
+            self._observations[stretch] = make_observation(self._state, stretch)
+        return self._observations[stretch]
 
     def _check_partial(self) -> None:
         if self._now_ns is None:
             raise ValueError("mask: the first reset is of all worlds")
-        common_ns = self._timetable.common_ns
+        common_ns = self.common_ns
         if common_ns == 0 or self._now_ns % common_ns != 0:
             when = f"every {common_ns} ns" if common_ns else "never"
             raise ValueError(
@@ -419,7 +406,7 @@ class Simulation:
         """Give the worlds of the mask other seeds."""
         inputs, outputs = [self._mask, seeds], [self._state.seeds]
         wp.launch(take_seeds, dim=self.count, inputs=inputs, outputs=outputs, device=self.device)
-        sensors = [sensor for group in self._state.groups for sensor in group.world_frames.values()]
+        sensors = [sensor for group in self._state.groups for sensor in group.frames.values()]
         if any(sensor.terms for sensor in sensors):
             worlds = set(np.flatnonzero(self._mask.numpy()).tolist())
             for sensor in sensors:
@@ -438,10 +425,10 @@ def _one_vehicle(
     return chosen if device is None else chosen.model_copy(update={"device": device})
 
 
-def _check_image_rates(images: Sequence[Mapping[str, Rate]], control: Rate) -> None:
-    for name, rate in (item for cameras in images for item in cameras.items()):
-        if not control.contains(rate):
+def _check_image_rates(schedule: Schedule) -> None:
+    for name, rate in schedule.images.items():
+        if not schedule.control.contains(rate):
             raise ValueError(
-                f"sensors.{name}.rate_hz must divide control.rate_hz = {control.rate_hz:g} in worlds, where "
-                f"pictures are taken at the end of steps, got {rate.rate_hz:g}"
+                f"sensors.{name}.rate_hz must divide control.rate_hz = {schedule.control.rate_hz:g} in "
+                f"worlds, where pictures are taken at the end of steps, got {rate.rate_hz:g}"
             )

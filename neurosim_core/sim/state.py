@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict, deque
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,8 @@ from neurosim_core.clock import to_ns
 from neurosim_core.control import CommandMode, Controller, ControllerContext, PathController
 from neurosim_core.frames import as_rows, normalised
 from neurosim_core.packets import Odometry
-from neurosim_core.runtime.cuda import Fence, GraphCache, HostCopy, make_stream
+from neurosim_core.runtime.cuda import HostCopy
+from neurosim_core.runtime.pipeline import Pipeline
 from neurosim_core.sensors.base import (
     Sampler,
     SamplerContext,
@@ -31,7 +32,7 @@ from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import WorldSettings
 from neurosim_core.sim.render_group import PictureAllocator, RenderGroupState, make_render_groups
 from neurosim_core.sim.scene_table import single_scene
-from neurosim_core.sim.schedule import Boundary, boundary_count_max
+from neurosim_core.sim.schedule import Boundary, Stretch
 from neurosim_core.sim.trace import Trace, WorldArrays, make_surfaces
 from neurosim_core.vehicle import DynamicsError
 from neurosim_core.vehicle.base import Vehicle, VehicleContext
@@ -61,11 +62,10 @@ class StartState:
 class Batch:
     """A stretch of a run that was flown, and that cameras may have to render."""
 
+    stretch: Stretch
+    """What happens in it, relative to its begin."""
     boundaries: Sequence[Boundary]
-    elapsed_ns: Sequence[int]
-    """From each boundary's predecessor to it [ns]."""
-    pattern: Hashable
-    """Same pattern, same flight: spans, and what is due at their ends."""
+    """The same at their stamps in the run."""
     closed_loop: bool
     """The path controller commands."""
     step_count: int
@@ -77,8 +77,8 @@ class Batch:
     """Slot of the first boundary in the trace, and of its first sample in the arrays of each sampler."""
     wanted: frozenset[str]
     """Cameras that look."""
-    last_seen_ns: Sequence[int]
-    """Of many worlds, for each group the instant before the batch, from its begin [ns], <= 0."""
+    begins: Any
+    """Mask of the worlds that begin with it, device array of int32, shape [N]; None: they go on."""
     until_ns: int
     """Packets up to here count [ns]: less than the whole batch where a collision ends the run."""
     jobs: Sequence[RenderJob] | None = None
@@ -96,6 +96,8 @@ class State:
     world_count: int
     on_host: bool
     """Packets go to the host; else results stay on the device."""
+    wall_s: dict[str, float]
+    """Wall-clock time by phase [s]."""
     vehicle: Vehicle
     worlds: Any
     """The vehicles and the clocks of their worlds as kernels see them (`trace.WorldArrays`)."""
@@ -110,32 +112,14 @@ class State:
     """Measurements of each sampler on the host, in the slots of the trace; empty: they stay on the device."""
     seeds: Any
     """Seed of each world, device array of uint64."""
-    batch_done: Sequence[Fence]
-    """For each batch that cameras may render, the point where the device has finished it."""
-    render_backlog: int
-    """The most batches that may be flown and not rendered."""
+    pipeline: Pipeline
+    """How batches share the device."""
     borrow_pictures: bool
     """Pictures are views that the next batch with the same buffers overwrites."""
     pictures_in_place: bool
     """Pictures for which the caller has a buffer are handed out before the device has finished them."""
     wanted: frozenset[str]
     """Cameras that look, from the next batch on."""
-    flight_stream: wp.Stream | None
-    """Stream of the vehicle's motion, ahead of the renderers; with one batch in flight nothing overlaps."""
-    render_streams: Sequence[wp.Stream | None]
-    """For each batch in flight: the last rays of one and the first of the next fill the device together."""
-    event_stream: wp.Stream | None
-    """Stream of the event scan, while the next batch is rendered."""
-    choice_stream: wp.Stream | None
-    """Stream on which adaptive groups choose the instants to render, ahead of the renderers."""
-    overlaps: bool
-    """Parts of a batch are launched on their own; on a CUDA device with one batch in flight, all as one
-    graph, unless an adaptive group or the host has to wait for the flight."""
-    flown: Sequence[Fence]
-    """For each batch that may be flown and not rendered, its end on `flight_stream`."""
-    rendered: Fence
-    """End of the batch whose rendering was launched last."""
-    graphs: GraphCache
     stamp_ns: int = 0
     """Time up to which packets have been returned [ns]."""
     launched_ns: int = 0
@@ -165,8 +149,6 @@ class State:
     counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
     """steps, commands, redone intervals (of the dynamics, in adaptive steps), renders, ticks left out, coarse
     ticks, events dropped, collisions."""
-    wall_s: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-    """Wall-clock time by phase [s]."""
 
 
 def make_state(
@@ -205,14 +187,15 @@ def make_state(
         worlds = _single_world(model, seed)
     in_flight = _in_flight(model, in_flight, on_host=on_host)
     count = len(worlds.seeds)
-    render_backlog = max(in_flight, render_backlog or 0)
-    slot_count = render_backlog * worlds.slot_count
+    flown_ahead = max(in_flight, render_backlog or 0)
+    slot_count = flown_ahead * worlds.slot_count
     seeds: Any = wp.array(np.array(worlds.seeds, dtype=np.uint64), dtype=wp.uint64, device=device)
     vehicle: Any = _make_vehicle(model, worlds, seeds)
     is_prescribed = model.path.attitude is not None
     if is_prescribed and start is not None:
         raise ValueError("path.kind poses says where an episode starts: give no start")
     world_arrays = _make_world_arrays(vehicle)
+    wall_s: dict[str, float] = defaultdict(float)
     ground = model.airframe.ground
     surfaces = make_surfaces(
         worlds.scenes.fields,
@@ -254,6 +237,7 @@ def make_state(
             worlds,
             seeds=seeds,
             history=trace.arrays.history,
+            clock_ns=world_arrays.clock_ns,
             in_flight=in_flight,
             on_host=on_host,
             allocate_picture=allocate_picture,
@@ -265,21 +249,18 @@ def make_state(
             if on_host
         },
         seeds=seeds,
-        overlaps=on_host and (in_flight > 1 or allocate_picture is not None or not _is_one_graph(model)),
-        batch_done=[Fence(device) for _ in range(in_flight)],
-        render_backlog=render_backlog,
+        pipeline=Pipeline(
+            device,
+            wall_s,
+            in_flight=in_flight,
+            flown_ahead=flown_ahead,
+            as_one=not on_host or (in_flight == 1 and allocate_picture is None and _is_one_graph(model)),
+            chooses=bool(model.schedule.sparse),
+        ),
+        wall_s=wall_s,
         borrow_pictures=borrow_pictures,
         pictures_in_place=allocate_picture is not None,
         wanted=frozenset(name for group in model.groups for name in group.names),
-        flight_stream=make_stream(device, high_priority=True) if in_flight > 1 else None,
-        render_streams=[make_stream(device) if in_flight > 1 else None for _ in range(in_flight)],
-        event_stream=make_stream(device, high_priority=True) if in_flight > 1 else None,
-        choice_stream=make_stream(device, high_priority=True)
-        if in_flight > 1 and model.schedule.sparse
-        else None,
-        flown=[Fence(device) for _ in range(render_backlog)],
-        rendered=Fence(device),
-        graphs=GraphCache(device),
     )
     reset_vehicles(model, state, wp.ones(count, dtype=wp.int32, device=device))
     return state
@@ -322,14 +303,14 @@ def _single_world(model: Model, seed: int | None) -> WorldSettings:
         seeds=[model.config.seed if seed is None else seed],
         rigs=[model.config.sensors],
         instant_count=0,
-        slot_count=boundary_count_max(model.schedule),
+        slot_count=model.schedule.boundary_count_max(),
     )
 
 
 def _history_length(model: Model, slot_count: int) -> int:
     """Return how many boundaries are kept for cameras, whatever is flown ahead."""
     window_ns = max((group.window_ns for group in model.groups), default=0)
-    return boundary_count_max(model.schedule, 1e-9 * window_ns) + slot_count
+    return model.schedule.boundary_count_max(1e-9 * window_ns) + slot_count
 
 
 def _make_vehicle(model: Model, worlds: WorldSettings, seeds: Any) -> Vehicle:

@@ -1,6 +1,6 @@
 """The data flow of the simulator, in one function: read `launch` first.
 
-    commands -> integrate -> sample the state -> pose cameras -> render -> scan events -> packets
+    command -> integrate -> sample the state -> pose cameras -> render -> scan frames -> packets
 
 What does not change is in `model.py`, what does in `state.py`: arrays with a leading axis of worlds, of which
 a single run has one. A run is cut into batches (`schedule.py`). Within a batch the vehicles are integrated
@@ -8,29 +8,36 @@ from boundary to boundary, and their states stay on the device (`integrate.py`, 
 group renders all its instants in one launch, every frame sensor scans them in one launch (`cameras.py`), and
 what goes to the host is read back once.
 
-How parts of a batch share a device (streams, graphs, several batches in flight) is in `runtime/cuda.py`; it
+How batches share a device (streams, graphs, several batches in flight) is in `runtime/pipeline.py`; it
 changes no result.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from neurosim_core.packets import Packet
+from neurosim_core.runtime.cuda import Launches
 from neurosim_core.runtime.timing import timed
 from neurosim_core.sim.cameras import (
+    RenderJob,
     acquire_picture_buffers,
-    choose,
-    find_in_worlds,
-    launch_cameras,
+    fetch_pictures,
     launch_key,
     plan_jobs,
-    plan_world_frames,
+    plan_scans,
+    pose_cameras,
     read_cameras,
     render,
-    scan,
 )
-from neurosim_core.sim.integrate import in_order, launch_flight, plan_flight, read_flight
+from neurosim_core.sim.integrate import (
+    fetch_flight,
+    in_order,
+    integrate,
+    read_flight,
+    take_command,
+)
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.state import Batch, State
 from neurosim_core.warp_start import refuse_forked_process
@@ -42,36 +49,47 @@ def launch(model: Model, state: State, batch: Batch) -> None:
     The batch says where the vehicles go, and which sensors are due there (`integrate.plan_batch`).
     """
     refuse_forked_process()
-    # commands -> motor speeds -> motion, from boundary to boundary; state sensors measure on the way
-    flight_key, flight = plan_flight(state, batch)
-    if state.overlaps:  # each part on a stream of its own, while other batches are in flight
-        launch_flight(state, batch, flight_key, flight)
+    with state.pipeline.batch(batch.number):
+        launch_flight(state, batch)
         launch_cameras(model, state, batch)
-    else:
-        # poses of the cameras -> one render of all their instants
-        jobs = plan_jobs(state, batch, choose(model, state, batch) if batch.jobs is None else ())
-        for job in jobs:
-            acquire_picture_buffers(job)
-        frames = plan_world_frames(state, batch)
-
-        def everything() -> tuple[object, ...]:
-            held = flight(), *(render(job) for job in jobs)
-            return *held, find_in_worlds(state, frames)  # log radiance -> events, in many worlds
-
-        with timed(state.wall_s, "flight and render"):
-            seen_key = tuple((each.offsets_ns, each.parity) for each in frames)
-            state.graphs.run((flight_key, seen_key, *map(launch_key, jobs)), everything)
-        scan(state, batch)  # log radiance -> events, in a world whose packets go to the host
     if state.on_host:
         state.in_flight.append(batch)
 
 
-def launch_first(model: Model, state: State, batch: Batch) -> None:
-    """Launch the batch at stamp 0 of many worlds: sensors sample, pictures are taken; nothing moves."""
-    _, flight = plan_flight(state, batch)
-    flight()
-    for job in plan_jobs(state, batch, choose(model, state, batch)):
-        render(job)
+def launch_flight(state: State, batch: Batch) -> None:
+    """Launch the motion of the vehicles through a batch."""
+    state.launched_count += 1
+    state.launched_ns = batch.until_ns
+    command = take_command(state)
+    key = (command.key, batch.slot, batch.closed_loop, batch.stretch.flight)
+
+    def fly() -> object:
+        held = command.launch()  # setpoints -> rotor speeds
+        integrate(state, batch)  # motion, from boundary to boundary; state sensors sample on the way
+        fetch_flight(state, batch)  # -> host
+        return held
+
+    with state.pipeline.flight(batch.number):
+        state.pipeline.run(Launches(key, fly))
+
+
+def launch_cameras(model: Model, state: State, batch: Batch) -> None:
+    """Launch what cameras see of a batch that flies: those that are wanted."""
+
+    def look(job: RenderJob) -> object:
+        views = pose_cameras(job)  # motion -> poses of cameras and bodies, at all instants
+        render(job, views)  # all instants of all worlds in one launch; then what is not ideal in pictures
+        fetch_pictures(job)  # -> host
+        return job.from_slots, job.to_slots
+
+    jobs = plan_jobs(model, state, batch)
+    with state.pipeline.renders(batch.number):
+        for job in jobs:
+            acquire_picture_buffers(job)
+            state.pipeline.run(Launches(launch_key(job), partial(look, job)))
+    with state.pipeline.scans(batch.number):
+        for scan in plan_scans(state, batch):  # log radiance -> events
+            state.pipeline.run(scan)
 
 
 def read(
@@ -85,8 +103,7 @@ def read(
     """
     batch = state.in_flight.popleft()
     with timed(state.wall_s, "read-back"):
-        flown = state.flown if state.overlaps else state.batch_done  # one graph has one end
-        flown[batch.number % len(flown)].wait()
+        state.pipeline.wait_flown(batch.number)
         packets = read_flight(model, state, batch)  # may end the run before the end of the batch
     packets += read_cameras(state, batch, borrow=last and state.borrow_pictures, meanwhile=meanwhile)
     state.rendered_count += 1

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from neurosim_core.runtime.cuda import HostCopy, RecordedLaunch
 from neurosim_core.scene.freespace import DistanceField, clearance_around
-from neurosim_core.vehicle import Multirotor
 from neurosim_core.vehicle.arrays import BLOCK_DIM, STATUS_COLLISION, STATUS_OK, MultirotorArrays
+from neurosim_core.vehicle.base import FlightKernel, Vehicle
 from neurosim_core.vehicle.history import History, append_history, make_history, motion_at
 
 wp.set_module_options({"enable_backward": False})
@@ -240,7 +240,8 @@ class Trace:
         for name, copy in zip(TraceRows._fields, self._copies, strict=False):
             setattr(self._rows_on_host, name, copy.mapped())
         self._record = self._recorded(_record)
-        self._flight: RecordedLaunch | None = None
+        self._vehicle: Vehicle | None = None
+        self._flight: FlightKernel | None = None
         self._poses: dict[int, RecordedLaunch] = defaultdict(lambda: self._recorded(_camera_poses))
         """By the address of the poses: that of the buffers of one batch in flight."""
 
@@ -257,9 +258,17 @@ class Trace:
         arguments = [self._context, slot, elapsed_ns, int(first), int(last)]
         self._record.launch(self.arrays.states.shape[1], arguments)
 
-    def fly(
+    def joins_spans(self, vehicle: Vehicle) -> bool:
+        """Return whether a vehicle records its state on the way: several spans are one launch."""
+        if vehicle is not self._vehicle:
+            self._vehicle, self._flight = vehicle, vehicle.flight_kernel(record_state)
+            if self._flight is not None:
+                self._fly = self._recorded(self._flight.kernel)
+        return self._flight is not None
+
+    def advance(
         self,
-        vehicle: Multirotor,
+        vehicle: Vehicle,
         slot: int,
         elapsed_ns: int,
         span_ns: int,
@@ -268,15 +277,19 @@ class Trace:
         first: bool,
         last: bool,
     ) -> None:
-        """Move all vehicles through `count` equal spans; `record` the state after each, in one launch.
+        """Move all vehicles through equal spans, one unless `joins_spans`, and `record` the state after each.
 
         Slots are those from `slot` on, and `elapsed_ns` is the time before the first span. `first`: a batch
         begins with it; `last`: a batch ends with the last span.
         """
-        if self._flight is None:
-            self._flight = self._recorded(vehicle.flight_kernel(record_state))
-        arguments = [self._context, count, slot, elapsed_ns, int(first), int(last)]
-        self._flight.launch(vehicle.count, [*vehicle.flight_inputs(span_ns), *arguments], key=span_ns)
+        if self.joins_spans(vehicle) and span_ns > 0:
+            assert self._flight is not None
+            arguments = [self._context, count, slot, elapsed_ns, int(first), int(last)]
+            self._fly.launch(vehicle.count, [*self._flight.inputs(span_ns), *arguments], key=span_ns)
+            return
+        if span_ns > 0:
+            vehicle.advance(span_ns)
+        self.record(slot, elapsed_ns + span_ns, first=first, last=last)
 
     def camera_poses(
         self,

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 import warp as wp
@@ -65,6 +66,14 @@ class VehicleConfig(BaseConfig):
         raise NotImplementedError
 
 
+class FlightKernel(NamedTuple):
+    """A kernel that moves all vehicles by equal spans, and records the state after each."""
+
+    kernel: wp.Kernel
+    inputs: Callable[[int], list[Any]]
+    """Returns its first inputs for spans of a length [ns]; those that say what is recorded follow."""
+
+
 class Vehicle(Protocol):
     """The vehicles of all worlds. What they do only launches, on a device."""
 
@@ -89,6 +98,13 @@ class Vehicle(Protocol):
 
     def accelerate(self) -> None:
         """Compute the accelerations at the present state."""
+
+    def flight_kernel(self, record: Any) -> FlightKernel | None:
+        """Return what moves all vehicles by equal spans, and records them; None: `advance` moves them.
+
+        Args:
+            record: Warp function that records the state of a vehicle; see `integrator.make_flight`.
+        """
 
 
 class HostVehicle:
@@ -153,6 +169,9 @@ class HostVehicle:
                 views["stamp_ns"][world] += duration_ns
                 for name, value in later._asdict().items():
                     views[name][world] = value
+
+    def flight_kernel(self, record: Any) -> None:
+        """Python moves the vehicles."""
 
     def begin(self, mask: Any) -> None:
         """Nothing is kept beside the state."""

@@ -24,7 +24,7 @@ from neurosim_core.vehicle.arrays import (
     check_status,
     read_state,
 )
-from neurosim_core.vehicle.base import VehicleConfig, VehicleContext
+from neurosim_core.vehicle.base import FlightKernel, VehicleConfig, VehicleContext
 from neurosim_core.vehicle.equations import Interval, Surroundings
 from neurosim_core.vehicle.ground import make_ground
 from neurosim_core.vehicle.integrator import make_flight, make_kernels, record_nothing
@@ -145,7 +145,9 @@ class Multirotor:
             rotors=rotors,
         )
         self._intervals: dict[int, Any] = {}
-        self._advance = RecordedLaunch(self.flight_kernel(record_nothing), self.device, block_dim=BLOCK_DIM)
+        self._advance = RecordedLaunch(
+            self.flight_kernel(record_nothing).kernel, self.device, block_dim=BLOCK_DIM
+        )
         self._accelerate = RecordedLaunch(self._kernels.accelerate, self.device, block_dim=BLOCK_DIM)
         self.reset()
 
@@ -232,20 +234,19 @@ class Multirotor:
         """
         if not isinstance(duration_ns, (int, np.integer)):
             raise TypeError(f"duration_ns must be an integer, got {duration_ns!r}")
-        kernel_inputs = [*self.flight_inputs(duration_ns), 0, 1, 0, 0, 0, 0]
+        kernel_inputs = [*self._flight_inputs(duration_ns), 0, 1, 0, 0, 0, 0]
         self._advance.launch(self.count, kernel_inputs, key=duration_ns)
         self._stamp_ns += duration_ns
 
-    def flight_kernel(self, record: Any) -> Any:
-        """Return the kernel that moves all vehicles by equal intervals, and records the state after each.
+    def flight_kernel(self, record: Any) -> FlightKernel:
+        """Return what moves all vehicles by equal spans, and records the state after each.
 
         Args:
             record: Warp function that records the state of a vehicle; see `integrator.make_flight`.
         """
-        return make_flight(frozenset(self.terms), record)
+        return FlightKernel(make_flight(frozenset(self.terms), record), self._flight_inputs)
 
-    def flight_inputs(self, duration_ns: int) -> list[Any]:
-        """Return the first inputs of `flight_kernel` for intervals of a length [ns]; see `advance`."""
+    def _flight_inputs(self, duration_ns: int) -> list[Any]:
         return [self.airframes, self._around, self._interval(duration_ns), self.arrays]
 
     def begin(self, mask: Any) -> None:

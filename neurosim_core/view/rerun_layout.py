@@ -61,11 +61,9 @@ def overlays(sensors: Sequence[SensorDescription]) -> dict[str, str]:
     def view(camera: SensorDescription) -> tuple[Any, ...]:
         return (*camera.position, *camera.orientation, camera.intrinsics)
 
-    cameras: list[tuple[SensorDescription, Any]] = [
-        (s, find("sensor", s.kind)) for s in sensors if s.intrinsics is not None
-    ]
-    below = {view(s): s.name for s, kind in cameras if getattr(kind, "encoding", "") == "rgb8"}
-    return {s.name: below[view(s)] for s, kind in cameras if kind.is_overlay and view(s) in below}
+    kinds: dict[str, Any] = {s.kind: find("sensor", s.kind) for s in sensors}
+    below = {view(s): s.name for s in sensors if getattr(kinds[s.kind], "encoding", "") == "rgb8"}
+    return {s.name: below[view(s)] for s in sensors if kinds[s.kind].is_overlay and view(s) in below}
 
 
 def picture_panel(vehicle: str, sensor: str, kind: str = "", *, below: str = "") -> Panel:

@@ -150,9 +150,11 @@ def same(one: data.Sample, two: data.Sample) -> None:
     assert all(np.array_equal(a, b) for a, b in zip(one.events, two.events, strict=True))
 
 
-def test_a_run_and_its_recording_give_the_same(tmp_path):
+@pytest.mark.parametrize("labels", [[], ["depth"]])
+def test_a_run_and_its_recording_give_the_same(labels, tmp_path):
     flow = {"kind": "optical_flow", "rate_hz": 20.0, "lens": LENS}
-    config = ns.load_config({**CONFIG, "sensors": {**CONFIG["sensors"], "flow": flow}})
+    camera = {**CONFIG["sensors"]["cam"], "labels": labels}
+    config = ns.load_config({**CONFIG, "sensors": {**CONFIG["sensors"], "cam": camera, "flow": flow}})
     with RecordingWriter(tmp_path / "a.h5", RecordingHeader(config_yaml="", seed=0, version="0")) as out:
         for packet in ns.run(config):
             out.write(packet)

@@ -9,18 +9,31 @@ import sys
 import threading
 import time
 import tracemalloc
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import h5py
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
+from neurosim_core import packets as packet_module
 from neurosim_core.live.config import LinkConfig
 from neurosim_core.live.links import Link
-from neurosim_core.packets import Collision, Delivery, Events, Image, ImuSample, Odometry, Packet
+from neurosim_core.packets import (
+    Collision,
+    Delivery,
+    Events,
+    FieldSpec,
+    Image,
+    ImuSample,
+    Odometry,
+    Packet,
+    schema_of,
+)
 from neurosim_core.record import (
     Intrinsics,
     Recording,
@@ -280,6 +293,7 @@ def test_root_belongs_to_the_first_camera_of_the_configuration(tmp_path):
             rate_hz=1.0,
             position=np.zeros(3),
             orientation=np.array([0, 0, 0, 1.0]),
+            has_events=True,
         )
         for name in ("right", "left")
     )
@@ -295,6 +309,31 @@ def test_root_belongs_to_the_first_camera_of_the_configuration(tmp_path):
     with h5py.File(tmp_path / "f.h5") as file:
         assert file["events/t"].shape == (9,)
         assert dsec_window(file["sensors/left"], 0, 10_001)["t"].shape == (5,)
+
+
+def test_events_of_a_class_that_is_not_known_here_are_read(tmp_path, monkeypatch):
+    @dataclass(frozen=True, kw_only=True, eq=False)
+    class Colored(Events):
+        color: Annotated[NDArray[np.uint8], FieldSpec("event")]
+
+    rng = np.random.default_rng(0)
+    packets = [
+        Colored(
+            **vars(make_events(rng, start_ns=10 * MS * k, stamp_ns=10 * MS * (k + 1), count=7)),
+            color=rng.integers(0, 3, 7, dtype=np.uint8),
+        )
+        for k in range(3)
+    ]
+    write(tmp_path / "f.h5", packets)
+    monkeypatch.delitem(packet_module._classes, schema_of(Colored).name)
+    with Recording(tmp_path / "f.h5") as flight:
+        for found, wanted in zip(flight.packets("dvs"), packets, strict=True):
+            assert not isinstance(found, Events)
+            assert {k: as_bits(v) for k, v in vars(found).items()} == {
+                k: as_bits(v) for k, v in vars(wanted).items()
+            }
+        t = np.concatenate([packet.t for packet in packets])
+        assert flight.events("dvs", 0.005, 0.025).t.tolist() == t[(t >= 5000) & (t < 25_000)].tolist()
 
 
 def test_event_windows_match_brute_force(tmp_path):

@@ -14,6 +14,7 @@ from neurosim_core.runtime.cuda import (
     Fence,
     GraphCache,
     HostCopy,
+    Launches,
     RecordedLaunch,
     make_stream,
     size_class,
@@ -50,26 +51,26 @@ def test_replays_do_what_the_launches_do(device, monkeypatch, capacity):
         assert calls == [1.0, 2.0, 1.0, 4.0, 2.0]  # once to launch and once to record
 
 
-def test_replays_are_on_the_stream_that_is_asked_for(device):
-    """They follow what is there, and not what the present stream holds; a milestone says when they end."""
-    values = wp.zeros(1 << 20, dtype=float, device=device)
-    present, other = make_stream(device), make_stream(device)
-    graphs, done = GraphCache(device), Fence(device)
+def test_launches_that_follow_each_other_are_one_graph(device):
+    """Those without a key are launched alone, in order."""
+    values = wp.ones(3, dtype=float, device=device)
+    graphs, calls = GraphCache(device), []
 
-    def launch() -> None:
-        for _ in range(20):
-            wp.launch(_add, dim=values.shape[0], inputs=[1.0, values], device=device)
+    def launches(step: float, key: str | None) -> Launches:
+        def launch() -> None:
+            calls.append(step)
+            wp.launch(_add, dim=3, inputs=[step, values], device=device)
 
-    wp.synchronize_device(device)
-    out = wp.zeros_like(values)
-    with use_stream(present):
-        for round_count in range(1, 6):
-            graphs.run("add", launch, stream=other)
-            done.set(other)
-            done.wait_on_stream()
-            wp.copy(out, values)
-            done.wait_on_stream()  # again: nothing more to wait for
-            assert (out.numpy() == 20.0 * round_count).all()
+        return Launches(key, launch)
+
+    with use_stream(make_stream(device)):
+        for round_count in range(1, 5):
+            graphs.run_all([launches(1.0, "a"), launches(2.0, "b"), launches(4.0, None), launches(8.0, "a")])
+            np.testing.assert_array_equal(values.numpy(), np.full(3, 1.0 + 15.0 * round_count))
+    if device == "cpu":
+        assert calls == 4 * [1.0, 2.0, 4.0, 8.0]
+    else:
+        assert calls == 2 * [1.0, 2.0, 4.0, 8.0] + 2 * [4.0]
 
 
 def test_a_relaunch_takes_other_arguments_each_time(device):

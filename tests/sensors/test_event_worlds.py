@@ -72,11 +72,18 @@ def test_values_that_are_no_radiance_are_counted(device):
     frames[1, 2, 2] = np.inf
     array = wp.array(frames, dtype=wp.float32, device=device)
     camera = WorldEventCamera(
-        [EventCameraConfig()] * 2, width=3, height=2, frames=array, capacity=100, sensor="e", seeds=[0, 1]
+        [EventCameraConfig()] * 2,
+        width=3,
+        height=2,
+        instant_count=3,
+        device=device,
+        capacity=100,
+        sensor="e",
+        seeds=[0, 1],
+        clock_ns=wp.zeros(2, dtype=wp.int64, device=device),
     )
-    camera.begin(wp.ones(2, dtype=wp.int32, device=device), 0)
-    clock = wp.zeros(2, dtype=wp.int64, device=device)
-    camera.find(clock, (0, 1000, 2000, 3000), 0)
+    camera.begin(array, 0, wp.ones(2, dtype=wp.int32, device=device))
+    camera.plan(array, [1000, 2000, 3000], 0).launch()
     assert camera.results.counters.numpy().tolist() == [[0, 0, 0], [0, 2, 3 * 6 - (1 * 6 + 4)]]
 
 
@@ -88,16 +95,18 @@ def test_a_reference_that_is_no_radiance_is_counted_and_zero(device, value):
         [EventCameraConfig(threshold_on=0.2, threshold_off=0.2)] * 2,
         width=3,
         height=2,
-        frames=(array := wp.array(frames, dtype=wp.float32, device=device)),
+        instant_count=3,
+        device=device,
         capacity=100,
         sensor="e",
         seeds=[0, 1],
+        clock_ns=wp.zeros(2, dtype=wp.int64, device=device),
     )
     frames[1, 0, 4] = value
-    array.assign(frames)
-    camera.begin(wp.ones(2, dtype=wp.int32, device=device), 0)
+    array = wp.array(frames, dtype=wp.float32, device=device)
+    camera.begin(array, 0, wp.ones(2, dtype=wp.int32, device=device))
     assert camera.results.counters.numpy().tolist() == [[0, 0, 0], [0, 1, 6 - 4]]
-    camera.find(wp.zeros(2, dtype=wp.int64, device=device), (0, 1000, 2000, 3000), 0)
+    camera.plan(array, [1000, 2000, 3000], 0).launch()
     t, x, y, polarity = camera.results.numpy(1)
     assert len(camera.results.numpy(0)[0]) == 0
     assert [(int(x[0]), int(y[0]), int(polarity[0]))] * len(t) == [(1, 1, 1)]
@@ -109,13 +118,21 @@ def test_stamps_do_not_depend_on_the_clock(device):
     frames = np.cumsum(rng.normal(0.0, 0.1, (5, 48)), axis=0).astype(np.float32)
     array = wp.array(np.repeat(frames[None], 3, axis=0), dtype=wp.float32, device=device)
     config = EventCameraConfig()
-    camera = WorldEventCamera(
-        [config] * 3, width=8, height=6, frames=array, capacity=500, sensor="e", seeds=[0, 1, 2]
-    )
-    camera.begin(wp.ones(3, dtype=wp.int32, device=device), 0)
     starts_ns = np.array([0, 1_234_567, 3_600 * 10**9 + 999])
+    camera = WorldEventCamera(
+        [config] * 3,
+        width=8,
+        height=6,
+        instant_count=5,
+        device=device,
+        capacity=500,
+        sensor="e",
+        seeds=[0, 1, 2],
+        clock_ns=wp.array(starts_ns, dtype=wp.int64, device=device),
+    )
+    camera.begin(array, 0, wp.ones(3, dtype=wp.int32, device=device))
     offsets = (0, 2_000_500, 4_001_000, 7_500_000, 7_501_001, 9_000_000)
-    camera.find(wp.array(starts_ns, dtype=wp.int64, device=device), offsets, 0)
+    camera.plan(array, offsets[1:], 0).launch()
     for world, start_ns in enumerate(starts_ns):
         alone = EventCamera(config, width=8, height=6, device="cpu")
         alone.reset(frames[0].reshape(6, 8), int(start_ns))

@@ -16,7 +16,17 @@ from small_room import room_scene
 
 import neurosim_core as ns
 from neurosim_core.flight import fly
-from neurosim_core.sensors import RateHz, Sampler, SamplerContext, StateSensorConfig
+from neurosim_core.sensors import (
+    FrameContext,
+    FrameSensor,
+    FrameSensorConfig,
+    Launches,
+    RateHz,
+    RenderRequest,
+    Sampler,
+    SamplerContext,
+    StateSensorConfig,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -215,3 +225,85 @@ else:
 def test_messages_of_own_sensors_come_from_their_packets():
     kind = ns.message_type(Height)
     assert ns.to_packet(kind(stamp_ns=3, height_m=1.5, sequence=2, frame_id=""), "height").height_m == 1.5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Brightness(ns.Packet):
+    """The mean of a rendered instant."""
+
+    log_radiance: float
+
+
+class BrightnessConfig(FrameSensorConfig):
+    """Takes the mean of every rendered instant."""
+
+    kind: Literal["test_brightness"] = "test_brightness"
+    rate_hz: RateHz = 200.0
+
+    packet_type = Brightness
+
+    def render_request(self) -> RenderRequest:
+        """Return what it asks of the renderer."""
+        return RenderRequest(frozenset(["log_radiance"]), rate_hz=self.rate_hz, every_instant=True)
+
+    def make(self, context: FrameContext) -> FrameSensor:
+        """Return the sensor at work, in one world or in many."""
+        return BrightnessSensor(context)
+
+
+class BrightnessSensor(FrameSensor):
+    """Has the means of the last batch in `results`, shape [N, K]."""
+
+    def __init__(self, context: FrameContext) -> None:
+        self._name, self._count = context.name, 0
+        self.results = np.zeros((len(context.seeds), context.instant_count))
+
+    def _look(self, frames: Any, count: int) -> None:
+        rows = frames.numpy().reshape(len(self.results), -1, *frames.shape[1:])
+        self.results[:, :count] = rows[:, :count].mean(axis=(2, 3))
+
+    def begin(self, frames: Any, stamp_ns: int, mask: Any) -> None:
+        """Take the mean of the first instant, too."""
+        self._look(frames, 1)
+
+    def plan(self, frames: Any, stamps_ns: Any, end_ns: int) -> Launches:
+        """Return what looks: it waits, and cannot be recorded."""
+        return Launches(None, lambda: self._look(frames, len(stamps_ns)))
+
+    def begin_read(self, stamps_ns: Any, *, until_ns: int) -> Any:
+        """Return what gives the packets of a batch."""
+        rows = list(zip(stamps_ns, self.results[0].tolist(), strict=False))
+
+        def packets() -> list[ns.Packet]:
+            found = [
+                Brightness(log_radiance=mean, stamp_ns=stamp, sensor=self._name, sequence=self._count + place)
+                for place, (stamp, mean) in enumerate(rows)
+                if stamp <= until_ns
+            ]
+            self._count += len(found)
+            return [*found]
+
+        return packets
+
+
+def test_one_frame_sensor_is_for_one_world_and_for_many(tmp_path):
+    """Its packets in a run are its results in worlds."""
+    camera = BrightnessConfig(lens={"width": 16, "height": 12, "horizontal_fov_rad": 1.5})
+    path = {"kind": "circle", "center_m": [0.0, 0.0, 1.2], "radius_m": 0.4, "speed_max_m_s": 0.5}
+    settings = {
+        "scene": room_scene(tmp_path),
+        "duration_s": 0.1,
+        "device": "cpu",
+        "path": path,
+        "sensors": {},
+    }
+    config = ns.load_config(settings).model_copy(update={"sensors": {"mean": camera}})
+    packets = list(ns.run(config))
+    assert [packet.stamp_ns for packet in packets] == list(range(0, 100_000_001, 5_000_000))
+    worlds = ns.Simulation(config, worlds=2)
+    found = [worlds.reset().frames["mean"][:, 0].copy()]
+    while len(found) < len(packets):
+        found += list(worlds.rollout(1).frames["mean"].T.copy())
+    expected = np.array([packet.log_radiance for packet in packets])
+    assert len(np.unique(expected)) > 10
+    np.testing.assert_array_equal(np.array(found), np.stack([expected, expected], axis=1))
