@@ -312,6 +312,6 @@ def _shown(config: SimulationConfig, only: Sequence[str] | None) -> dict[str, tu
     odometry, *_ = describe_sensors({"odometry": OdometrySensorConfig(rate_hz=config.control.rate_hz)})
     shown = known if only is None else only
     return {
-        name: (odometry, *(s for s in own if s.kind != odometry.kind and s.name in shown))
+        name: (odometry, *(s for s in own if s.name != odometry.name and s.name in shown))
         for name, own in sensors.items()
     }
