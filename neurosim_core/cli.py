@@ -303,12 +303,13 @@ def _run(arguments: argparse.Namespace) -> int:
 @contextlib.contextmanager
 def _prepare(arguments: argparse.Namespace, module: str) -> Iterator[tuple[SimulationConfig, SceneReader]]:
     """Import a module, while processes read the scene and prepare to plan; give settings and reader."""
-    from neurosim_core.path_process import PlanningProcess
+    from neurosim_core.path_process import PlanningProcess, may_need_planning
     from neurosim_core.scene.reader import SceneReader
     from neurosim_core.settings_file import unchecked_settings
 
     settings = unchecked_settings(arguments.config, settings_of(arguments))
-    with PlanningProcess() as planner, SceneReader(settings, planner=planner) as reader:
+    planning = PlanningProcess() if may_need_planning(settings) else contextlib.nullcontext()
+    with planning as planner, SceneReader(settings, planner=planner) as reader:
         from rich.console import Console
 
         with (

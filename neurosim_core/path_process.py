@@ -6,8 +6,8 @@ import dataclasses
 import pickle
 import subprocess
 import sys
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from neurosim_core.runtime.child import begin_child, end_child, start_child
 
@@ -19,6 +19,13 @@ if TYPE_CHECKING:
 
 class NotPlannedError(Exception):
     """The process has not planned the paths that are asked for; who plans them here is told what is wrong."""
+
+
+def may_need_planning(settings: Mapping[str, Any]) -> bool:
+    """Return whether settings, which were not checked, may ask for paths around obstacles."""
+    path = settings.get("path")
+    kind = path.get("kind") if isinstance(path, Mapping) else None
+    return kind in (None, "tour", "waypoints") or bool(settings.get("vehicles"))
 
 
 class PlanningProcess:

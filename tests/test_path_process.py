@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 from small_room import room_scene
 
 import neurosim_core as ns
-from neurosim_core.path_process import PlanningProcess
+from neurosim_core.path_process import PlanningProcess, may_need_planning
 from neurosim_core.scene.reader import SceneReader
 from neurosim_core.sim import Model, make_model, model
+from neurosim_core.trajectory import CollisionFreeConfig, PathConfig
 from neurosim_core.trajectory.planner import PlanningError
 
 
@@ -45,6 +46,17 @@ def test_a_path_is_the_one_that_is_planned_here(tmp_path, monkeypatch):
     assert there.free_space.notes == here.free_space.notes
     assert there.free_space.device == "cpu"
     assert there.free_space.clearance(there.free_space.seed_m)[0] > 0.3
+
+
+def test_no_process_is_started_where_nothing_is_planned():
+    """Of all kinds of paths, those around obstacles need it, and it is known before they are imported."""
+    kinds = get_args(get_args(PathConfig)[0])
+    assert len(kinds) > 5
+    for config in kinds:
+        kind = config.model_fields["kind"].default
+        assert may_need_planning({"path": {"kind": kind}}) == issubclass(config, CollisionFreeConfig)
+    assert may_need_planning({})
+    assert may_need_planning({"path": {"kind": "hover"}, "vehicles": {"a": {}}})
 
 
 def test_a_process_that_ends_too_early_is_done_without(tmp_path):

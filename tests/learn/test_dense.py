@@ -257,9 +257,8 @@ def test_worlds_give_the_windows_of_runs(scene):
         next(world_windows(config, HEADS["flow"], worlds=2, bins=5, window_s=0.0505))
 
 
-def test_worlds_draw_thresholds_and_render_as_often_as_is_said(scene, monkeypatch):
+def test_worlds_draw_thresholds_and_render_as_often_as_is_said(scene):
     """On one path worlds see the same but for their thresholds; fewer renders see nearly the same events."""
-    monkeypatch.setattr(dense_worlds, "_PATHS_MAX", 1)
     config, options = settings(scene, seed=3), {"worlds": 2, "bins": 5, "window_s": 0.05}
     totals = {}
     for renders, spread in ((None, 0.0), (2, 0.0), (2, 0.25)):

@@ -9,9 +9,9 @@ from concurrent.futures.process import BrokenProcessPool
 
 import numpy as np
 import pytest
+from core_counts import cores
 
 import neurosim_core as ns
-from neurosim_core.learn import dense_flights
 from neurosim_core.learn.dense_flights import PathPlanner
 from neurosim_core.sim import plan_paths
 
@@ -28,11 +28,10 @@ def flight(scene_seed, path_seed, **path):
     )
 
 
-def test_paths_are_those_of_this_process_in_the_order_of_flights(monkeypatch):
+def test_paths_are_those_of_this_process_in_the_order_of_flights():
     """Two processes, each with one of two scenes: what they answer is put back in order."""
-    monkeypatch.setattr(dense_flights, "core_count", lambda: 4)
     flights = [flight(scene, path) for scene, path in ((0, 1), (1, 2), (0, 3))]
-    with PathPlanner() as planner:
+    with cores(4), PathPlanner() as planner:
         planner.begin(flights)
         found = planner.result()
         for path, config in zip(found, flights, strict=True):
@@ -44,9 +43,8 @@ def test_paths_are_those_of_this_process_in_the_order_of_flights(monkeypatch):
             planner.result()
 
 
-def test_a_process_that_died_is_an_error(monkeypatch):
-    monkeypatch.setattr(dense_flights, "core_count", lambda: 2)
-    with PathPlanner() as planner:
+def test_a_process_that_died_is_an_error():
+    with cores(2), PathPlanner() as planner:
         planner.begin([flight(0, 1)])
         for process in multiprocessing.active_children():
             process.kill()

@@ -115,7 +115,7 @@ def test_a_crash_terminates_and_is_no_time_out(make):
 def test_observations_share_memory_with_the_simulator(make):
     env = make()
     observations, _ = env.reset()
-    assert observations["events"].data_ptr() == env._surface.array.ptr
+    assert observations["events"].data_ptr() == env.view.surface.data_ptr()
     assert observations["events"].dtype == torch.float32
 
 

@@ -72,14 +72,6 @@ def test_no_other_run_is_resumed_than_is_asked_for(arguments, message, tmp_path,
     assert message.format(folder=tmp_path) in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("speed", "film"), [([], "unseen.webp"), (["--speed", "4.5"], "unseen-4.5m_s.webp")])
-def test_an_evaluation_at_another_speed_has_its_own_animation(speed, film, tmp_path, capsys, monkeypatch):
-    pytest.importorskip("torch", reason="needs the extra learn")
-    monkeypatch.setattr("neurosim_core.learn.train.evaluate_run", lambda run, **where: [("events", where)])
-    assert main(["learn", "eval", str(tmp_path), *speed]) == 0
-    assert f"wrote {tmp_path}/{film}" in capsys.readouterr().out
-
-
 def test_without_the_extra_the_error_names_it(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(ImportError, match=r"pip install -e '\.\[learn\]'"):

@@ -19,9 +19,8 @@ pytest.importorskip("onnx", reason="needs the extra learn")
 pytest.importorskip("tensorboard", reason="needs the extra learn")
 
 from neurosim_core.cli import main  # noqa: E402
-from neurosim_core.learn import population  # noqa: E402
 from neurosim_core.learn.dagger import DaggerConfig  # noqa: E402
-from neurosim_core.learn.population import _lacking, train_population  # noqa: E402
+from neurosim_core.learn.population import train_population  # noqa: E402
 from neurosim_core.learn.ppo import PpoConfig  # noqa: E402
 from neurosim_core.learn.train import TrainConfig, train  # noqa: E402
 
@@ -89,22 +88,49 @@ def test_two_workers_of_a_cluster_train_one_policy_as_torchrun_does(tmp_path):
     assert both != alone
 
 
-def test_a_cluster_that_is_too_small_is_told(tmp_path):
+class Placed(ValueError):
+    """A cluster was asked to begin a training."""
+
+
+@pytest.fixture
+def addresses(monkeypatch):
+    """Return the addresses that are connected to: of a cluster of two CPUs, where nothing begins."""
+
+    def place(*_):
+        raise Placed("it would begin here")
+
+    asked = []
+    ray = SimpleNamespace(
+        is_initialized=lambda: False,
+        init=lambda address, **_: asked.append(address),
+        shutdown=lambda: None,
+        cluster_resources=lambda: {"CPU": 2.0},
+        util=SimpleNamespace(placement_group=place),
+    )
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    return asked
+
+
+def test_a_cluster_that_is_too_small_is_told(tmp_path, addresses):
     """It may grow: Ray waits until it has."""
-    ray = SimpleNamespace(cluster_resources=lambda: {"CPU": 2.0})
-    assert _lacking(ray, CONFIG, 2) == ""
-    assert _lacking(ray, CONFIG, 3) == "2 of 3 CPUs"
-    assert _lacking(ray, dataclasses.replace(CONFIG, device="cuda:0"), 1) == "0 of 1 GPUs"
+    on_gpu = dataclasses.replace(CONFIG, device="cuda:0")
+    for config, workers, lacking in ((CONFIG, 2, ""), (CONFIG, 3, "2 of 3 CPUs"), (on_gpu, 1, "0 of 1 GPUs")):
+        said: list[str] = []
+        with pytest.raises(Placed):
+            train_population(tmp_path, {"a": config}, address="there:1", workers=workers, say=said.append)
+        assert said == [f"a waits: the cluster has {lacking}"] * bool(lacking)
+    assert addresses == ["there:1"] * 3
     for configs, workers in (({"a": CONFIG}, 0), ({}, 1)):
         with pytest.raises(ValueError, match="1 training and 1 worker at least"):
             train_population(tmp_path, configs, workers=workers)
 
 
-def test_without_an_address_the_cluster_is_that_of_this_machine(tmp_path, monkeypatch):
-    asked: dict[str, object] = {}
-    monkeypatch.setattr(population, "train_population", lambda folder, configs, **given: asked.update(given))
-    assert main(["learn", "hover", "--device", "cpu", "--out", str(tmp_path), "--ray", "--workers", "2"]) == 0
-    assert asked == {"address": "auto", "workers": 2}
+def test_without_an_address_the_cluster_is_that_of_this_machine(tmp_path, addresses, capsys):
+    assert main(["learn", "hover", "--device", "cpu", "--out", str(tmp_path), "--ray", "--workers", "3"]) == 1
+    assert addresses == ["auto"]
+    told = capsys.readouterr()
+    assert "seed-0 waits: the cluster has 2 of 3 CPUs" in told.out
+    assert "it would begin here" in told.err
 
 
 def test_where_no_cluster_runs_that_is_said(tmp_path, monkeypatch, capsys):
