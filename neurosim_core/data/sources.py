@@ -130,7 +130,7 @@ def packets_of(
                 own.append(sensor.packet(picture[world].copy(), stamp_ns=stamp_ns, **header))
             for row, offset_ns in enumerate(() if taken is None else taken.offsets_ns):
                 values = {field: array[row, world] for field, array in arrays.items()}
-                own.append(sensor.packet_type(stamp_ns=begin_ns + offset_ns, **header, **values))
+                own.append(sensor.packet_class(stamp_ns=begin_ns + offset_ns, **header, **values))
             if events is not None and stamp_ns > 0:
                 columns = events.numpy(world)
                 order = np.argsort(columns[0], kind="stable")  # those of a `Simulation(sorted=False)` are not
