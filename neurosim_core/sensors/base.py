@@ -365,9 +365,14 @@ class ImageSensorConfig(CameraConfig, PictureSensorConfig):
         """The shutter, unless it is global and takes no time."""
         return self.shutter if self.shutter.window_ns else None
 
+    @property
+    def packet_encoding(self) -> str:
+        """Encoding of its pictures with these settings: `encoding`, unless a sensor says another."""
+        return self.encoding
+
     def packet(self, picture: NDArray[Any], **header: Any) -> Packet:
         """Return a picture as a packet, whose class has `data` and `encoding`; see `PictureSensorConfig`."""
-        packet: Packet = self.packet_class(data=picture, encoding=self.encoding, **header)  # type: ignore[call-arg]
+        packet: Packet = self.packet_class(data=picture, encoding=self.packet_encoding, **header)  # type: ignore[call-arg]
         return packet
 
 
