@@ -185,8 +185,8 @@ def test_what_a_sensor_gives_is_what_its_recording_gives(tmp_path):
     config = ns.load_config({**CONFIG, "sensors": {"cam": CONFIG["sensors"]["cam"], **sensors}})
     given = fields_of(config)
     assert {name: field for name, field in given.items() if field is not None} == {
-        "cam": "events", "depth": "depth", "range": "depth", "rgb": "rgb", "frame_camera": "rgb", "grey": "rgb",
-        "optical_flow": "flow", "imu": "imu", "odometry": "pose", "state_estimate": "pose",
+        "cam": "events", "depth": "depth", "range": "depth", "rgb": "rgb", "frame_camera": "rgb",
+        "grey": "rgb", "optical_flow": "flow", "imu": "imu", "odometry": "pose", "state_estimate": "pose",
     }  # fmt: skip
     with RecordingWriter(tmp_path / "a.h5", RecordingHeader(config_yaml="", seed=0, version="0")) as out:
         for packet in ns.run(config):
