@@ -117,7 +117,8 @@ def packets_of(
     packets: list[list[Packet]] = [[] for _ in worlds]
     for name in sensors:
         sensor: Any = simulation.model.config.sensors[name]
-        events, taken = observation.events.get(name), observation.samples.get(name)
+        events = observation.events.get(name)
+        taken: Any = observation.samples.get(name)
         picture = observation.images[name].numpy() if name in observation.fresh else None
         arrays = {} if taken is None else {field: array.numpy() for field, array in taken.arrays.items()}
         dropped = [] if events is None else events.dropped.numpy().tolist()
