@@ -113,7 +113,7 @@ def fly(
     report.setup_wall_s = dict(state.wall_s)
     print_plan(console, model)
 
-    sees_events = any(issubclass(sensor.packet_type, Events) for sensor in config.sensors.values())
+    sees_events = any(issubclass(sensor.packet_class, Events) for sensor in config.sensors.values())
     stop = threading.Event()
     begin = time.perf_counter()
 

@@ -233,6 +233,8 @@ def _read_samplers(state: State, batch: Batch) -> list[Packet]:
     packets: list[Packet] = []
     for index, (name, copies) in enumerate(state.sampler_copies.items()):
         stamps = [boundary.stamp_ns for boundary in batch.boundaries if index in boundary.samplers]
+        if not stamps:
+            continue
         columns = {field: copy.rows(batch.slot, len(stamps))[:, 0] for field, copy in copies.items()}
         for sample, stamp_ns in enumerate(stamps):
             packet = sample_packet(

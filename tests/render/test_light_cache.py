@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 from render_scenes import plane, point_light, scene_of
 
-from neurosim_core.render import light_cache, lighting
+from neurosim_core.render import light_cache
 from neurosim_core.render.config import LightingConfig
 from neurosim_core.render.lighting import bake_light
 from neurosim_core.render.refine import refine
@@ -18,20 +18,20 @@ from neurosim_core.render.refine import refine
 
 @pytest.fixture
 def entries(tmp_path, monkeypatch):
-    """The files that are kept, in a folder of their own; every scene is large enough."""
+    """The files that are kept, in a folder of their own."""
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    monkeypatch.setattr(lighting, "_KEPT_FACES_MIN", 1)
     return lambda: sorted((tmp_path / "light").glob("*"))
 
 
 SCENE = scene_of(plane(4.0), lights=(point_light((0.0, 0.0, 2.0), 3.0),))
 
 
-def bake(scene=SCENE, **config):
-    return bake_light(scene, refine(scene, 0.5), LightingConfig(**config), device="cpu")
+def bake(scene=SCENE, *, edge_m=0.05, **config):
+    """Bake the light of more than 10,000 triangles, unless edges are longer."""
+    return bake_light(scene, refine(scene, edge_m), LightingConfig(**config), device="cpu")
 
 
-def test_light_is_read_for_the_same_scene_and_settings_alone(entries, monkeypatch):
+def test_light_is_read_for_the_same_scene_and_settings_alone(entries):
     first = bake()
     assert len(entries()) == 1
     np.testing.assert_array_equal(bake(), first)
@@ -44,8 +44,8 @@ def test_light_is_read_for_the_same_scene_and_settings_alone(entries, monkeypatc
     for other in (bake(brighter), bake(shadow_ray_count=8)):
         assert other.max() > 0.1
     assert len(entries()) == 3
-    monkeypatch.setattr(lighting, "_KEPT_FACES_MIN", 10**6)
-    np.testing.assert_array_equal(bake(), first)  # a small scene is lit
+    assert bake(edge_m=0.5).max() > 0.1
+    assert len(entries()) == 3  # a small scene is lit as fast as its light is read
 
 
 def test_what_is_damaged_or_cannot_be_written_is_computed(entries, tmp_path):

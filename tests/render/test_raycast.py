@@ -294,6 +294,17 @@ def test_instants_and_threads_do_not_change_a_bit(device):
             np.testing.assert_array_equal(again[name], at_once[name])
 
 
+@pytest.mark.parametrize("samples", [4, 16])
+def test_light_of_several_samples_is_the_same_without_geometry(device, samples):
+    """On CUDA four threads render four pixels together then, at one instant or at two."""
+    arrays = upload_scene(room(), BAKED.model_copy(update={"samples_per_pixel": samples}), device)
+    for count in (1, 2, 5):
+        beside = render(arrays, LENS, POSES[:count], outputs=OUTPUTS, device=device)
+        alone = render(arrays, LENS, POSES[:count], outputs=("log_radiance", "rgb"), device=device)
+        np.testing.assert_allclose(alone["log_radiance"], beside["log_radiance"], atol=1e-5)  # order of sums
+        np.testing.assert_allclose(alone["rgb"].astype(int), beside["rgb"].astype(int), atol=1)
+
+
 def test_images_are_written_for_the_instants_that_have_a_slot(device):
     """Cameras that share a cast: log radiance of all instants, images only where requested."""
     arrays = upload_scene(room(), BAKED, device)

@@ -1,4 +1,4 @@
-"""What threads of the ray caster render: each pixel is taken once."""
+"""How often threads of the ray caster take a turn."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from neurosim_core.render.kernel_data import RenderTerms
-from neurosim_core.render.raycast import _casts_quads, _locate_pixel, turn_count
+from neurosim_core.render.raycast import turn_count
 
 LARGEST = 2**31 - 1
 
@@ -32,25 +31,3 @@ def test_turns_are_counted_up_to_the_largest_index(device, end, step):
         device=device,
     )
     np.testing.assert_array_equal(counts.numpy(), [len(range(begin, end, step)) for begin in begins])
-
-
-@pytest.mark.parametrize("paired", [False, True])
-def test_each_pixel_of_a_tile_is_rendered_once_by_four_adjacent_threads(paired: bool) -> None:
-    threads: dict[tuple[int, int, int], list[int]] = {}
-    for half in range(1 + paired):
-        for thread in range(64):
-            for patch in range(4):
-                instant = (thread // 16) % 2 if paired else 0
-                pixel = (instant, *_locate_pixel(patch, thread, paired, half))
-                threads.setdefault(pixel, []).append(thread)
-    assert len(threads) == 64 * (1 + paired)
-    assert {pixel[1] for pixel in threads} == {pixel[2] for pixel in threads} == set(range(8))
-    assert all(four == list(range(four[0] // 4 * 4, four[0] // 4 * 4 + 4)) for four in threads.values())
-
-
-def test_only_light_at_all_instants_is_rendered_so() -> None:
-    terms = RenderTerms(textured=False, emissive=False, baked=True, supersampled=True, quads=True)
-    assert _casts_quads(("log_radiance", "rgb"), terms)
-    assert not _casts_quads(("rgb",), terms)
-    assert not _casts_quads(("log_radiance", "depth"), terms)
-    assert not _casts_quads(("log_radiance",), terms._replace(quads=False))
