@@ -50,8 +50,8 @@ def launch(model: Model, state: State, batch: Batch) -> None:
     """
     refuse_forked_process()
     with state.pipeline.batch(batch.number):
-        launch_flight(state, batch)
-        launch_cameras(model, state, batch)
+        launch_flight(state, batch)  # command -> integrate -> sample the state
+        launch_cameras(model, state, batch)  # pose cameras -> render -> scan frames
     if state.on_host:
         state.in_flight.append(batch)
 

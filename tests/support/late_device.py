@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from neurosim_core.runtime import cuda
+from neurosim_core.runtime import cuda, pipeline
 from neurosim_core.sensors import event_keys, event_noise, event_pixels, event_readout, events
 
 _MODULES = (cuda, events, event_keys, event_noise, event_pixels, event_readout)
@@ -171,11 +171,16 @@ class _LateFence:
 class _LateGraphCache:
     """Records sequences and replays them, for `cuda.GraphCache`."""
 
+    run_all = cuda.GraphCache.run_all
+
     def __init__(self, device: LateDevice) -> None:
         self._device = device
         self._graphs: dict[Any, list[Callable[[], None]] | None] = {}
 
     def run(self, key: Any, launch: Callable[[], Any]) -> None:
+        if key is None:
+            launch()
+            return
         if key not in self._graphs:
             self._graphs[key] = None
             launch()
@@ -189,6 +194,14 @@ class _LateGraphCache:
             self._device.replayed_count += 1
         for operation in self._graphs[key] or ():
             self._device.add(operation)
+
+
+def install_pipeline(monkeypatch: Any, device: LateDevice) -> None:
+    """Let pipelines that are made from now on launch on the device; launches call its `add`."""
+    monkeypatch.setattr(pipeline, "Fence", lambda _: _LateFence(device))
+    monkeypatch.setattr(pipeline, "GraphCache", lambda _: _LateGraphCache(device))
+    monkeypatch.setattr(pipeline, "make_stream", device.make_stream)
+    monkeypatch.setattr(pipeline, "use_stream", device.on)
 
 
 def install(monkeypatch: Any, device: LateDevice) -> None:
