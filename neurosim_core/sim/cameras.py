@@ -139,7 +139,10 @@ def plan_job(state: State, batch: Batch, index: int, places: Sequence[int]) -> R
         image_slots.append(used if due else -1)
         used += bool(due)
     posed, placed = slots, tuple(image_slots)
-    pattern: Hashable | None = (id(group), buffer_index, posed, placed) if group.only_launches else None
+    due_pictures = tuple((slot, name) for _, slot, name in pictures)  # sensors process theirs
+    pattern: Hashable | None = (id(group), buffer_index, posed, placed, due_pictures)
+    if not group.only_launches:
+        pattern = None
     if group.world_count > 1:  # frustum candidate lists look at all instants of a world
         posed += (slots[-1],) * (group.capacity - len(slots))
     buffers = group.buffers[buffer_index]
