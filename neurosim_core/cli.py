@@ -399,13 +399,13 @@ def _view(arguments: argparse.Namespace) -> int:
             port=arguments.port,
             open_browser=not arguments.no_browser,
         )
-    from neurosim_core.flight import rerun_file
+    from neurosim_core.flight import check_recorded, recorded_file, rerun_file
 
     if arguments.save is not None and arguments.save.suffix != ".rrd":
         from neurosim_core.view.animation import save_animation
 
-        flight = arguments.flight
-        save_animation(flight / "flight.h5" if flight.is_dir() else flight, arguments.save)
+        check_recorded(arguments.flight)
+        save_animation(recorded_file(arguments.flight), arguments.save)
         print(f"wrote {arguments.save}")
         return 0
     file = rerun_file(arguments.flight, save=arguments.save)

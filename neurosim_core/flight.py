@@ -113,7 +113,7 @@ def fly(
     report.setup_wall_s = dict(state.wall_s)
     print_plan(console, model)
 
-    sees_events = any(issubclass(sensor.packet_type, Events) for sensor in config.sensors.values())
+    sees_events = any(issubclass(sensor.packet_class, Events) for sensor in config.sensors.values())
     stop = threading.Event()
     begin = time.perf_counter()
 
@@ -165,27 +165,19 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
 
     `flight`: the folder that `fly` left, its flight.h5 or flight.rrd, or any file or folder of events.
     """
-    from neurosim_core.io import is_event_file
     from neurosim_core.io.transfer import as_recording
     from neurosim_core.view.rerun_log import RerunLogger
     from neurosim_core.view.rerun_sdk import RerunStream
     from neurosim_core.view.rerun_shapes import scene_shapes
 
-    recorded = flight / "flight.h5" if flight.is_dir() and not is_event_file(flight) else flight
+    recorded = recorded_file(flight)
     # events.raw and events.csv may be different events: each has a Rerun file of its own
     is_flight = recorded.suffix in (".h5", ".rrd")
     made = recorded.with_suffix(".rrd") if is_flight else recorded.with_name(f"{recorded.name}.rrd")
     is_newer = made.exists() and (is_flight or made.stat().st_mtime_ns > recorded.stat().st_mtime_ns)
     if save is None and is_newer:
         return made
-    if not recorded.exists():
-        folder = flight if flight.suffix == "" else "DIR"
-        raise FileNotFoundError(f"no flight at {recorded}; `neurosim run --out {folder}` makes one")
-    if not is_event_file(recorded):
-        raise FileNotFoundError(
-            f"no flight at {recorded}: neither a recording nor a file of events; "
-            f"`neurosim convert {recorded} events.h5` makes events of a video"
-        )
+    check_recorded(flight)
     with as_recording(recorded) as file, Recording(file) as source:
         header = source.header
         settings = yaml.safe_load(header.config_yaml)
@@ -204,6 +196,28 @@ def rerun_file(flight: Path, *, save: Path | None = None) -> Path:
             (save or made).unlink(missing_ok=True)  # the next call must not take it for the whole
             raise
     return save or made
+
+
+def recorded_file(flight: Path) -> Path:
+    """Return the file of a folder of `fly`; other files, and folders with events, are what they are."""
+    from neurosim_core.io import is_event_file
+
+    return flight / "flight.h5" if flight.is_dir() and not is_event_file(flight) else flight
+
+
+def check_recorded(flight: Path) -> None:
+    """Raise a FileNotFoundError where there is neither a flight nor a file of events."""
+    from neurosim_core.io import is_event_file
+
+    recorded = recorded_file(flight)
+    if not recorded.exists():
+        folder = flight if flight.suffix == "" else "DIR"
+        raise FileNotFoundError(f"no flight at {recorded}; `neurosim run --out {folder}` makes one")
+    if not is_event_file(recorded):
+        raise FileNotFoundError(
+            f"no flight at {recorded}: neither a recording nor a file of events; "
+            f"`neurosim convert {recorded} events.h5` makes events of a video"
+        )
 
 
 def header_of(model: Model, config: SimulationConfig | None = None) -> RecordingHeader:

@@ -115,7 +115,7 @@ def print_report(console: Console, model: Model, state: State, report: FlightRep
     if model.config.sensors:
         counts_of = (_describe_packets(name, report, state) for name in model.config.sensors)
         facts.add_row("packets", ", ".join(counts_of))
-    if any(issubclass(sensor.packet_type, Events) for sensor in model.config.sensors.values()):
+    if any(issubclass(sensor.packet_class, Events) for sensor in model.config.sensors.values()):
         rate = report.event_count / simulated_s / 1e6 if simulated_s else 0.0
         dropped = counts["events dropped"]
         facts.add_row("events", f"{report.event_count:,} ({rate:.2f} M/s), {dropped:,} dropped")

@@ -56,6 +56,7 @@ def start_warp() -> None:
 
 def has_kernels() -> bool:
     """Return whether kernels of a simulator are in the kernel cache; a first flight compiles them all."""
+    start_warp()  # which says where the cache is
     return any(Path(str(wp.config.kernel_cache_dir)).glob("wp_neurosim_core.*"))
 
 

@@ -141,6 +141,29 @@ def test_an_animation_can_be_made_from_the_recording(flown, tmp_path):
     assert (np.abs(frames[1] - frames[0]).max(axis=2) > 60).sum() > 200
 
 
+@pytest.mark.parametrize("name", ["converted.h5", "events.raw"])
+def test_an_animation_of_events_alone_is_refused_and_says_what_can_be_made(flown, tmp_path, capsys, name):
+    file = tmp_path / name
+    assert cli.main(["convert", str(flown[0] / "flight.h5"), str(tmp_path / "events.raw")]) == 0
+    if name != "events.raw":
+        assert cli.main(["convert", str(tmp_path / "events.raw"), str(file)]) == 0
+    assert cli.main(["view", str(file), "--save", str(tmp_path / "film.webp")]) == 1
+    told = capsys.readouterr().err
+    assert f"an animation needs pictures in colour, and {file} has none" in told
+    assert f"save what there is for Rerun, as {tmp_path / 'film.rrd'}" in told
+    assert cli.main(["view", str(tmp_path / "nosuch"), "--save", str(tmp_path / "film.webp")]) == 1
+    assert f"`neurosim run --out {tmp_path / 'nosuch'}` makes one" in capsys.readouterr().err
+
+
+def test_an_animation_of_a_converted_flight_has_no_plan(flown, tmp_path):
+    """Pictures and poses that come from a file of another format are without their scene."""
+    pytest.importorskip("rosbags")
+    assert cli.main(["convert", str(flown[0] / "flight.h5"), str(tmp_path / "flight.mcap")]) == 0
+    assert cli.main(["view", str(tmp_path / "flight.mcap"), "--save", str(tmp_path / "film.webp")]) == 0
+    with Image.open(tmp_path / "film.webp") as film:
+        assert film.size == (2 * round(220 * 48 / 36) + 6, 220)  # the picture and the events
+
+
 def test_view_serves_a_file_on_its_port_and_ends_with_its_viewer(flown):
     """Killed by SIGTERM it takes the viewer along: nobody listens on the port any more."""
     folder, _ = flown

@@ -20,6 +20,7 @@ import cortex.messages
 import neurosim_core as ns
 from neurosim_core.io import open_events
 from neurosim_core.live.recorder import Recorder
+from neurosim_core.sensors.event_labels import LabelledEvents
 from neurosim_core.sinks import SinkConfig, SinkContext
 
 
@@ -212,17 +213,17 @@ def test_an_event_file_that_cannot_be_written_is_refused_at_once(scene, tmp_path
     assert not (tmp_path / "flight").exists()
 
 
-def test_a_flight_is_published(scene, tmp_path, monkeypatch):
-    """A reliable reader gets every packet, as it is recorded."""
+@pytest.mark.parametrize("labels", [[], ["depth"]])
+def test_a_flight_is_published(scene, tmp_path, monkeypatch, labels):
+    """A reliable reader gets every packet, as it is recorded; events with their truth, if they have it."""
     monkeypatch.setenv("CORTEX_RUNTIME_DIR", str(tmp_path))
     found: dict[str, list[Any]] = {"events": [], "odometry": []}
-    flying = threading.Thread(
-        target=ns.fly,
-        args=(settings(scene, out={"kind": "cortex", "wait_s": 30.0}), tmp_path / "flight"),
-    )
+    plain = settings(scene, out={"kind": "cortex", "wait_s": 30.0}).model_dump(mode="json")
+    config = ns.load_config(plain, overrides={"sensors.events.labels": labels})
+    flying = threading.Thread(target=ns.fly, args=(config, tmp_path / "flight"))
     with cortex.Node("reader") as node:
-        kinds = {"events": cortex.messages.Events, "odometry": cortex.messages.Odometry}
-        kinds["depth"] = cortex.messages.Image
+        events = ns.message_type(LabelledEvents) if labels else cortex.messages.Events
+        kinds = {"events": events, "odometry": cortex.messages.Odometry, "depth": cortex.messages.Image}
         subscribers = {
             name: node.subscriber(f"/drone/{name}", kind, policy=cortex.reliable())
             for name, kind in kinds.items()
@@ -236,6 +237,10 @@ def test_a_flight_is_published(scene, tmp_path, monkeypatch):
         kept = [packet for packet in recorded(tmp_path / "flight") if packet.sensor == name]
         assert [message.stamp_ns for message in messages] == [packet.stamp_ns for packet in kept]
     assert (found["odometry"][-1].position == kept[-1].position).all()
+    if labels:
+        kept = [packet for packet in recorded(tmp_path / "flight") if packet.sensor == "events"]
+        assert all((m.depth == p.depth).all() for m, p in zip(found["events"], kept, strict=True))
+        assert sum(len(message.depth) for message in found["events"]) > 100
 
 
 def test_a_flight_that_waits_for_its_readers_waits_once_and_can_be_stopped(scene, tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import shutil
 import subprocess
 import sys
@@ -28,6 +29,20 @@ def test_an_empty_kernel_cache_is_known(tmp_path, monkeypatch):
 
     wp.launch(store, dim=1, outputs=[wp.zeros(1, dtype=int, device="cpu")], device="cpu")
     assert has_kernels()
+
+
+def test_the_kernel_cache_is_found_before_anything_was_computed(tmp_path):
+    """As in a script that begins with `fly`: Warp does not know its own cache until it has started."""
+    program = "from neurosim_core.warp_start import has_kernels; print(has_kernels())"
+    (tmp_path / wp.config.version / "wp_neurosim_core.first_0123").mkdir(parents=True)
+    run = subprocess.run(
+        [sys.executable, "-c", program],
+        env=os.environ | {"WARP_CACHE_PATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert run.stdout == "True\n"
 
 
 def test_that_no_device_is_to_be_seen_is_not_told():

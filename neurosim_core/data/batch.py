@@ -33,7 +33,7 @@ class Sample:
     events: EventArrays | None = None
     """Events with start < t <= stamp, in whole microseconds."""
     depth: NDArray[np.float32] | None = None
-    """Planar z at the stamp [m], inf where nothing was hit, shape [H, W]."""
+    """Planar z at the stamp [m], of a range camera the length of the ray; inf: no hit; shape [H, W]."""
     flow: NDArray[np.float32] | None = None
     """The flow picture of the stamp [px], shape [H, W, 2]."""
     rgb: NDArray[np.uint8] | None = None

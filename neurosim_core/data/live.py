@@ -83,7 +83,7 @@ class LiveSource:
     def _join(self, node: Any, namespace: str, config: WindowConfig) -> Iterator[_Flight]:
         from cortex import latest, reliable
         from cortex.messages import Simulation
-        from neurosim_core.live.messages import sensor_message_type
+        from neurosim_core.live.messages import message_type
         from neurosim_core.live.topics import SIMULATION, stream_topic
 
         announced = node.subscriber(namespace + SIMULATION, Simulation, policy=latest())
@@ -97,7 +97,7 @@ class LiveSource:
             subscribers = {
                 sensor: node.subscriber(
                     namespace + stream_topic(vehicle, sensor),
-                    sensor_message_type(rig.sensors[sensor].kind),
+                    message_type(rig.sensors[sensor].packet_class),
                     policy=reliable(_QUEUE),
                 )
                 for field, sensor in chosen.items()

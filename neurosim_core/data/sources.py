@@ -9,19 +9,10 @@ import numpy as np
 
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.data.batch import Sample
-from neurosim_core.data.windows import PacketWindows, WindowConfig, choose_sensors
-from neurosim_core.packets import Events, Packet
+from neurosim_core.data.windows import PacketWindows, WindowConfig, choose_sensors, field_of
+from neurosim_core.packets import Events, Packet, schema_of
 from neurosim_core.sim.observation import Observation
 from neurosim_core.sim.simulation import Simulation
-
-_KINDS = {
-    "event_camera": "events",
-    "depth": "depth",
-    "optical_flow": "flow",
-    "rgb": "rgb",
-    "imu": "imu",
-    "odometry": "pose",
-}
 
 
 class SampleSource(Protocol):
@@ -49,8 +40,15 @@ def numbered(config: SimulationConfig, number: int, *, flights_per_scene: int = 
 
 
 def fields_of(config: SimulationConfig) -> dict[str, str | None]:
-    """Return the field that each sensor of a configuration gives."""
-    return {name: _KINDS.get(sensor.kind) for name, sensor in config.sensors.items()}
+    """Return the field that each sensor of a configuration gives: that of its recording."""
+    return {name: _field_of(sensor) for name, sensor in config.sensors.items()}
+
+
+def _field_of(sensor: Any) -> str | None:
+    packet, encoding = sensor.packet_class, ""
+    if any(field.name == "encoding" for field in schema_of(packet).fields):
+        encoding = getattr(packet, "encoding", "") or getattr(sensor, "packet_encoding", "")
+    return field_of(schema_of(packet), encoding)
 
 
 class RunSource:
@@ -119,7 +117,8 @@ def packets_of(
     packets: list[list[Packet]] = [[] for _ in worlds]
     for name in sensors:
         sensor: Any = simulation.model.config.sensors[name]
-        events, taken = observation.events.get(name), observation.samples.get(name)
+        events = observation.events.get(name)
+        taken: Any = observation.samples.get(name)
         picture = observation.images[name].numpy() if name in observation.fresh else None
         arrays = {} if taken is None else {field: array.numpy() for field, array in taken.arrays.items()}
         dropped = [] if events is None else events.dropped.numpy().tolist()
@@ -129,8 +128,9 @@ def packets_of(
             if picture is not None:
                 own.append(sensor.packet(picture[world].copy(), stamp_ns=stamp_ns, **header))
             for row, offset_ns in enumerate(() if taken is None else taken.offsets_ns):
-                values = {field: array[row, world] for field, array in arrays.items()}
-                own.append(sensor.packet_type(stamp_ns=begin_ns + offset_ns, **header, **values))
+                rows = {field: array[row, world] for field, array in arrays.items()}
+                packet = taken.packet(rows, stamp_ns=begin_ns + offset_ns, **header)
+                own += [] if packet is None else [packet]
             if events is not None and stamp_ns > 0:
                 columns = events.numpy(world)
                 order = np.argsort(columns[0], kind="stable")  # those of a `Simulation(sorted=False)` are not

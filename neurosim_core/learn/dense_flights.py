@@ -94,7 +94,7 @@ def _stream_flights(namespace: str, settings: Mapping[str, Any], seed: int, core
     with Node(f"flights{namespace.replace('/', '_')}") as node:
         publishers = {
             name: node.publisher(
-                namespace + stream_topic(vehicle, name), message_type(sensor.packet_type), max_wait_s=600.0
+                namespace + stream_topic(vehicle, name), message_type(sensor.packet_class), max_wait_s=600.0
             )
             for name, sensor in config.sensors.items()
         }

@@ -19,7 +19,6 @@ from cortex import messages as msg
 from neurosim_core import packets as pkt
 from neurosim_core.live.topics import COMMANDS, WORLD_FRAME, body_frame, sensor_frame
 from neurosim_core.record.header import SensorDescription
-from neurosim_core.registry import find
 from neurosim_core.trajectory import Path
 
 ClockNs = Callable[[int], int]
@@ -57,11 +56,6 @@ def message_type(packet: type[pkt.Packet]) -> type[Any]:
         derived = type(packet.__name__, (), namespace)
         _TYPES[packet] = cortex.message(derived, name=f"neurosim/{packet.__name__}")
     return _TYPES[packet]
-
-
-def sensor_message_type(kind: str) -> type[Any]:
-    """Return the message type of the packets that sensors of a kind yield."""
-    return message_type(find("sensor", kind).packet_type)  # type: ignore[attr-defined]
 
 
 def _field_type(packet: type[pkt.Packet], field: pkt.FieldSchema) -> Any:

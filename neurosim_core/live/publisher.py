@@ -160,7 +160,7 @@ class PacketPublisher:
 
         for sensor in sensors:
             if sensor.name != "odometry":
-                message = messages.sensor_message_type(sensor.kind)
+                message = messages.message_type(config.sensors[sensor.name].packet_class)
                 frame_id = topics.sensor_frame(vehicle, sensor)
                 add(sensor.name, message, messages.to_message, latch=False, frame_id=frame_id)
         add(COLLISION, msg.Collision, messages.to_message, latch=False)
@@ -334,7 +334,7 @@ def _expected_bytes(sensor: SensorConfig | None) -> int:
     Memory that is made before the flight delays no message in it: pixels fire at most about 100 times a
     second on average, also in fast flight.
     """
-    if not (isinstance(sensor, CameraConfig) and schema_of(sensor.packet_type).has_events):
+    if not (isinstance(sensor, CameraConfig) and schema_of(sensor.packet_class).has_events):
         return 0
     window_s = sensor.packets.stamp_ns(1) * 1e-9
     count = _PIXEL_EVENTS_HZ * window_s * sensor.lens.width * sensor.lens.height

@@ -15,7 +15,7 @@ from cortex import messages as msg
 from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.live import topics
 from neurosim_core.live.call import SensorRates, describe_status
-from neurosim_core.live.messages import sensor_message_type, setpoint_of, to_packet
+from neurosim_core.live.messages import message_type, setpoint_of, to_packet
 from neurosim_core.record.header import SensorDescription, describe_sensors
 from neurosim_core.scene.bodies import make_bodies
 from neurosim_core.sensors.odometry import OdometrySensorConfig
@@ -203,7 +203,9 @@ class LiveSession:
         subscribe(at("rotor_speeds"), msg.RotorSpeeds, partial(self._log_rotor_speeds, vehicle))
         for sensor in self._vehicles[vehicle]:
             log = partial(self._log_packet, vehicle, sensor.name)
-            subscribe(at(sensor.name), sensor_message_type(sensor.kind), log, sensor=sensor.name)
+            own = config.sensors.get(sensor.name)  # None: odometry, which is there without
+            message = msg.Odometry if own is None else message_type(own.packet_class)
+            subscribe(at(sensor.name), message, log, sensor=sensor.name)
         subscribe(at("collision"), msg.Collision, partial(self._log_packet, vehicle, "collision"))
         for field in ("depth", "flow"):
             log = partial(self._log_packet, vehicle, f"predicted_{field}")
@@ -310,6 +312,6 @@ def _shown(config: SimulationConfig, only: Sequence[str] | None) -> dict[str, tu
     odometry, *_ = describe_sensors({"odometry": OdometrySensorConfig(rate_hz=config.control.rate_hz)})
     shown = known if only is None else only
     return {
-        name: (odometry, *(s for s in own if s.kind != odometry.kind and s.name in shown))
+        name: (odometry, *(s for s in own if s.name != odometry.name and s.name in shown))
         for name, own in sensors.items()
     }

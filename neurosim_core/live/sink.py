@@ -44,7 +44,8 @@ class CortexSink:
         self._publishers: dict[str, tuple[Publisher[Any], str]] = {}
         for sensor in context.header.sensors:
             topic = topics.stream_topic(self._vehicle, sensor.name)
-            publisher = self._node.publisher(topic, messages.sensor_message_type(sensor.kind))
+            packet = context.model.config.sensors[sensor.name].packet_class
+            publisher = self._node.publisher(topic, messages.message_type(packet))
             self._publishers[sensor.name] = publisher, topics.sensor_frame(self._vehicle, sensor)
         collisions = self._node.publisher(
             topics.stream_topic(self._vehicle, "collision"), messages.message_type(Collision)

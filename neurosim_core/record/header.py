@@ -93,7 +93,7 @@ def describe_sensors(sensors: Mapping[str, SensorConfig]) -> tuple[SensorDescrip
 
 def _describe(name: str, sensor: Any) -> SensorDescription:
     mount, lens = getattr(sensor, "mount", None), getattr(sensor, "lens", None)
-    more: dict[str, Any] = {"has_events": schema_of(sensor.packet_type).has_events}
+    more: dict[str, Any] = {"has_events": schema_of(sensor.packet_class).has_events}
     if mount is not None:
         more["position"] = np.array(mount.position_m)
         more["orientation"] = mount.quaternion() if lens is None else mount.optical_quaternion()

@@ -50,7 +50,7 @@ class SensorConfig(BaseConfig):
     """Settings of a sensor. Subclasses add `kind: Literal["..."]` and are registered under that kind."""
 
     packet_type: ClassVar[type[Packet]]
-    """Class of its packets."""
+    """Class of its packets, whatever its settings; `packet_class` may say more."""
     is_overlay: ClassVar[bool] = False
     """A viewer draws its pictures over those of a colour camera with the same view."""
     reported: ClassVar[Mapping[str, Callable[[Any], str]]] = {}
@@ -91,6 +91,11 @@ class SensorConfig(BaseConfig):
     def packets(self) -> Rate:
         """When its packets come."""
         return self.clock
+
+    @property
+    def packet_class(self) -> type[Packet]:
+        """Class of its packets with these settings: `packet_type`, or a subclass of it."""
+        return self.packet_type
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -360,9 +365,14 @@ class ImageSensorConfig(CameraConfig, PictureSensorConfig):
         """The shutter, unless it is global and takes no time."""
         return self.shutter if self.shutter.window_ns else None
 
+    @property
+    def packet_encoding(self) -> str:
+        """Encoding of its pictures with these settings: `encoding`, unless a sensor says another."""
+        return self.encoding
+
     def packet(self, picture: NDArray[Any], **header: Any) -> Packet:
         """Return a picture as a packet, whose class has `data` and `encoding`; see `PictureSensorConfig`."""
-        packet: Packet = self.packet_type(data=picture, encoding=self.encoding, **header)  # type: ignore[call-arg]
+        packet: Packet = self.packet_class(data=picture, encoding=self.packet_encoding, **header)  # type: ignore[call-arg]
         return packet
 
 
@@ -395,10 +405,13 @@ class FrameSensor(ABC):
     def plan(self, frames: Any, stamps_ns: Sequence[int], end_ns: int) -> Launches | None:
         """Return what makes something of the frames of a batch; None: nothing is to be done.
 
+        Keys of launches tell those of this sensor apart; other sensors may have the same.
+
         Args:
             frames: Log radiance, device array of float32, shape [N K, H, W]; stays as it is until the batch
                 has been read. It is there when the launches run.
-            stamps_ns: Times of the first frames of each world [ns], at most K, increasing.
+            stamps_ns: Times of the first frames of each world [ns], at most K, increasing. There may be none,
+                in a run also before `begin`.
             end_ns: End of the batch [ns].
         """
 

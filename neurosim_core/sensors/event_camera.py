@@ -22,7 +22,7 @@ from neurosim_core.sensors.base import (
     RenderRequest,
 )
 from neurosim_core.sensors.event_config import EventCameraConfig, describe_pixel
-from neurosim_core.sensors.event_labels import EventLabel, EventLabels
+from neurosim_core.sensors.event_labels import EventLabel, EventLabels, LabelledEvents
 from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS
 from neurosim_core.sensors.event_worlds import WorldEventCamera
 from neurosim_core.sensors.events import EventCamera
@@ -64,6 +64,11 @@ class EventSensorConfig(FrameSensorConfig):
         if self.classes is not None and "semantic" not in self.labels:
             raise ValueError(f"classes are for the label semantic, got labels {list(self.labels)}")
         return self
+
+    @property
+    def packet_class(self) -> type[Events]:
+        """With labels, events that have them."""
+        return LabelledEvents if self.labels else Events
 
     @property
     def look_back_ns(self) -> int:

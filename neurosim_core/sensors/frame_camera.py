@@ -18,14 +18,14 @@ Reference: EMVA 1288 (2021), Standard for characterization of image sensors and 
 # No `from __future__ import annotations`: Warp needs the annotations of kernels in closures as objects.
 
 import functools
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 from pydantic import Field
 
-from neurosim_core.packets import Image
+from neurosim_core.packets import Packet
 from neurosim_core.random import normal4, random_bits, stream_id
 from neurosim_core.registry import register
 from neurosim_core.render.launch import kernel_variant
@@ -78,7 +78,12 @@ class FrameCameraConfig(ImageSensorConfig):
     """Transfer curve from light to pixel values: srgb, linear, or a gamma (exponent 1 / gamma)."""
 
     output = "radiance"
-    encoding: ClassVar[Any] = "rgb8"
+    encoding = "rgb8"
+
+    @property
+    def packet_encoding(self) -> str:
+        """After the colours and bits of a pixel."""
+        return f"{self.color}{8 if self.bits == 8 else 16}"
 
     @property
     def remembers(self) -> bool:
@@ -89,15 +94,14 @@ class FrameCameraConfig(ImageSensorConfig):
         """Return what makes frames of radiance."""
         return FrameProcess(self, context)
 
-    def packet(self, picture: NDArray[Any], **header: Any) -> Image:
+    def packet(self, picture: NDArray[Any], **header: Any) -> Packet:
         """Return a picture as a packet."""
         channels = 3 if self.color == "rgb" else 1
         if self.bits == 8:
             data = picture[..., :channels].astype(np.uint8)
         else:
             data = picture[..., :channels] << (16 - self.bits)
-        encoding: Any = f"{self.color}{8 if self.bits == 8 else 16}"
-        return Image(data=data if channels == 3 else data[..., 0], encoding=encoding, **header)
+        return super().packet(data if channels == 3 else data[..., 0], **header)
 
 
 @wp.struct

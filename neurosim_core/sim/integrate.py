@@ -31,9 +31,13 @@ COLLISION = "collision"
 
 
 def forget_controllers(state: State) -> None:
-    """Have controllers of outside commands made anew, with other gains; the path controller stays."""
+    """Have controllers of outside commands made anew, with other gains; the path controller stays.
+
+    So does the buffer of rotor speeds, which have no controller: graphs copy from it.
+    """
+    for mode in state.controllers:
+        del state.commands[mode]
     state.controllers.clear()
-    state.commands.clear()
 
 
 Command = Setpoint | ArrayLike | None
@@ -148,10 +152,10 @@ def integrate(state: State, batch: Batch) -> None:
     samplers = list(state.samplers.values())
     taken = [batch.slot] * len(samplers)
     vehicle, trace, slot = state.vehicle, state.trace, batch.slot
-    for boundary, span_ns, count in _spans(batch.stretch, joined=trace.joins_spans(vehicle)):
+    for boundary, span_ns, count in _spans(batch.stretch, joined=trace.joins_spans):
         end = slot + count
         record = {"first": slot == batch.slot, "last": end == batch.slot + len(batch.boundaries)}
-        trace.advance(vehicle, slot, elapsed_ns, span_ns, count, **record)
+        trace.advance(slot, elapsed_ns, span_ns, count, **record)
         slot, elapsed_ns = end, elapsed_ns + count * span_ns
         for index in boundary.samplers:
             samplers[index].measure(taken[index])

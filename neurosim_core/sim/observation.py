@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
+from neurosim_core.packets import Packet
 from neurosim_core.sim.schedule import Stretch
 from neurosim_core.sim.state import State
 from neurosim_core.vehicle.arrays import MultirotorArrays
@@ -22,6 +23,8 @@ class Samples:
     """By name, as the fields of its packets: device arrays of shape [sample, N, ...]."""
     offsets_ns: tuple[int, ...]
     """When each sample was taken, after the begin of the step [ns]."""
+    packet: Callable[..., Packet | None]
+    """Returns a sample of one world as a packet: `Sampler.packet`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,6 +63,7 @@ def make_observation(state: State, stretch: Stretch) -> Observation:
         samples[name] = Samples(
             arrays={field: _first(rows, len(offsets_ns)) for field, rows in sampler.arrays.items()},
             offsets_ns=offsets_ns,
+            packet=sampler.packet,
         )
     return Observation(
         state=arrays,

@@ -12,6 +12,7 @@ from PIL import Image as Pillow
 from PIL import ImageDraw
 
 from neurosim_core.config import load_config
+from neurosim_core.io.transfer import as_recording
 from neurosim_core.packets import Events, Image, Odometry
 from neurosim_core.record import Recording
 from neurosim_core.record.disk import naming_file
@@ -31,20 +32,23 @@ def save_animation(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
 
     `rate_hz`: pictures a second of simulated time, and of the animation [Hz].
     """
-    with Recording(recorded) as flight:
-        scene = load_config(yaml.safe_load(flight.header.config_yaml)).scene.load()
+    with as_recording(recorded) as file, Recording(file) as flight:
         first = {name: next(flight.packets(name), None) for name in flight.sensors}
         colored = [name for name, p in first.items() if isinstance(p, Image) and p.data.ndim == 3]
         if not colored:
             raise ValueError(
-                f"an animation needs pictures in colour, and {recorded} has none: add a sensor {{kind: rgb}}"
+                f"an animation needs pictures in colour, and {recorded} has none: add a sensor {{kind: rgb}} "
+                f"to the flight, or save what there is for Rerun, as {out.with_suffix('.rrd')}"
             )
         pictures = list(flight.packets(colored[0]))
         events = next((p for p in first.values() if isinstance(p, Events)), None)
         tracked = [name for name, p in first.items() if isinstance(p, Odometry)]
         poses = [p for p in (flight.packets(*tracked) if tracked else ()) if isinstance(p, Odometry)]
         pose_stamps_ns = [p.stamp_ns for p in poses]
-        way = _Way(scene, np.array([pose.position for pose in poses]).reshape(-1, 3))
+        settings = yaml.safe_load(flight.header.config_yaml)
+        way = None
+        if poses and "conversion" not in settings:  # what was converted has no scene
+            way = _Way(load_config(settings).scene.load(), np.array([pose.position for pose in poses]))
         frames = []
         for stamp_ns in range(0, pictures[-1].stamp_ns + 1, round(1e9 / rate_hz)):
             picture = min(pictures, key=lambda p: abs(p.stamp_ns - stamp_ns))
@@ -54,7 +58,7 @@ def save_animation(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
                 end_s = (stamp_ns // 1000 + 1) * 1e-6
                 window = flight.events(events.sensor, end_s - _EVENT_WINDOW_S, end_s)
                 panels.append(_scaled(event_picture(window, width=events.width, height=events.height)))
-            if poses:
+            if way is not None:
                 panels.append(way.drawn(int(np.searchsorted(pose_stamps_ns, stamp_ns))))
             frames.append(_beside(panels))
     options: dict[str, Any] = {"quality": 60} if out.suffix == ".webp" else {}
@@ -84,8 +88,7 @@ class _Way:
     """The plan of a scene, and a path in it."""
 
     def __init__(self, scene: Scene, position: NDArray[np.float64]) -> None:
-        height_m = float(np.median(position[:, 2])) if len(position) else float(scene.bounds_m[:, 2].mean())
-        plan = cut_plan(scene, height_m=height_m)
+        plan = cut_plan(scene, height_m=float(np.median(position[:, 2])))
         self._low, size = plan.bounds[0], plan.bounds[1] - plan.bounds[0]
         self._scale = (_HEIGHT_PX - 2) / size[1]
         self._picture = Pillow.new("RGB", (round(self._scale * size[0]) + 2, _HEIGHT_PX), (255, 255, 255))

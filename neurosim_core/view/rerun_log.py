@@ -140,7 +140,8 @@ class RerunLogger:
         self._below = {name: overlays(sensors) for name, sensors in self._vehicles.items()}
         self._tables: dict[str, Table] = {}
         self._trail_end: dict[str, NDArray[np.float64]] = {}
-        self._pose_of: dict[str, str] = {}
+        named = [name for name, sensors in vehicles.items() if any(s.name == "odometry" for s in sensors)]
+        self._pose_of = dict.fromkeys(named, "odometry")  # of others the first that comes
         self._bodies: Mapping[str, BodyConfig] = {}
         self._scene = scene
         self._panels: dict[str, dict[Panel, None]] = {name: {} for name in self._vehicles}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 
 import pytest
-from peer import Number, connect
+from peer import Number, connect, without_rings
 from processes import Child
 from runtime_directory import runtime
 
@@ -37,6 +37,13 @@ def numbers(node):
     """A publisher and its reliable subscriber."""
     publisher, subscriber = connect(node, "/numbers", Number, reliable(256, 60.0))
     return publisher, subscriber
+
+
+@pytest.fixture
+def sockets_alone():
+    """All readers of the test attach through sockets."""
+    with without_rings():
+        yield
 
 
 @pytest.fixture

@@ -14,12 +14,15 @@ import sys
 import time
 import zlib
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from multiprocessing.connection import Connection
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
 import cortex
+import cortex.link
 import cortex.node
 from cortex import Array, Node, Policy, UInt32
 from cortex.message_types import message
@@ -93,6 +96,27 @@ def connect(
     subscriber = reader.subscriber(topic, kind, callback, policy=policy)
     assert publisher.wait_for_subscribers(timeout_s=60.0)
     return publisher, subscriber
+
+
+def stand_still(subscriber: Any) -> None:
+    """Let nobody read for a subscriber from now on but who calls it: the node leaves it alone."""
+    subscriber.top_up = subscriber.dismiss = lambda now_ns: None
+
+
+def go_on(subscriber: Any) -> None:
+    """Let the node read for a subscriber again."""
+    del subscriber.top_up, subscriber.dismiss
+
+
+def without_rings() -> AbstractContextManager[Any]:
+    """Let readers that attach in the block do so as where the C module is missing: through sockets."""
+    return mock.patch.object(cortex.link, "native", None)
+
+
+def slots_held(publisher: Any) -> int:
+    """Slots of shared memory that any reader of a publisher holds."""
+    with publisher._pub_sockets.lock:
+        return int(publisher._fanout.ring._ring.leased())
 
 
 def take(subscriber: Any, timeout_s: float = 0.0) -> Any:

@@ -17,12 +17,11 @@ from types import SimpleNamespace
 
 import pytest
 import zmq
-from peer import Block, Number, accounted, connect, is_whole, make_block, take_all
+from peer import Block, Number, accounted, connect, is_whole, make_block, stand_still, take_all
 from processes import SOON_S, Beside, wait_for
 
 import cortex.broadcast
 import cortex.link
-import cortex.subscriber
 from cortex import keep_last, reliable
 from cortex.broadcast import Listener
 from cortex.compiled import native
@@ -306,9 +305,8 @@ def test_a_ring_that_brings_nonsense_is_left_for_the_socket(make_node, start_chi
     assert child.ask()["lost"] == 0
 
 
-def test_a_ring_is_read_to_its_end_however_long_that_takes(make_node, start_child, monkeypatch):
+def test_a_ring_is_read_to_its_end_however_long_that_takes(make_node, start_child):
     """Its publisher has left long ago when its reader comes to read."""
-    monkeypatch.setattr(cortex.subscriber, "LEAVING_NS", 0)
     child = start_child("peer")
     child.ask(do="publisher", topic="/blocks", type="Block")
     subscriber = make_node().subscriber("/blocks", Block, policy=reliable(2, SOON_S))
@@ -317,19 +315,18 @@ def test_a_ring_is_read_to_its_end_however_long_that_takes(make_node, start_chil
     child.finish()
     wait_for(lambda: not subscriber.sources())
     for _ in range(5):
-        subscriber.dismiss(time.monotonic_ns())
+        subscriber.dismiss(time.monotonic_ns() + 10**11)
     assert [subscriber.recv(SOON_S).number for _ in range(40)] == list(range(40))
-    wait_for(lambda: not subscriber._links)
+    wait_for(lambda: subscriber.dismiss(time.monotonic_ns() + 10**11) or not subscriber.carriers)
     assert subscriber.counters.lost == 0
 
 
-def test_what_came_before_the_answer_was_read_counts(make_node, start_child, monkeypatch):
+def test_what_came_before_the_answer_was_read_counts(make_node, start_child):
     """Its publisher was gone before the reader, which lost most of it, looked for the first time."""
-    monkeypatch.setattr(cortex.subscriber, "LEAVING_NS", 10**15)
-    monkeypatch.setattr(cortex.subscriber, "TOP_UP_NS", 10**15)  # the node looks not either
     child = start_child("peer")
     child.ask(do="publisher", topic="/blocks", type="Block")
     subscriber = make_node().subscriber("/blocks", Block, policy=keep_last(8))
+    stand_still(subscriber)
     child.ask(do="await_subscribers", topic="/blocks")
     child.ask(do="publish", topic="/blocks", count=100, size=RING_BYTES // 20)
     child.finish()
@@ -382,12 +379,12 @@ def test_a_reader_that_cannot_map_the_ring(make_node, start_child, asked, policy
 
 
 @pytest.mark.parametrize("latch", [False, True], ids=["", "latched"])
-def test_what_lies_in_a_ring_that_cannot_be_mapped_is_lost(make_node, start_child, asked, monkeypatch, latch):
+def test_what_lies_in_a_ring_that_cannot_be_mapped_is_lost(make_node, start_child, asked, latch):
     """It was published to a reader that was attached, and had not looked yet."""
-    monkeypatch.setattr(cortex.subscriber, "TOP_UP_NS", 10**15)  # the node looks not either
     child = start_child("peer")
     child.ask(do="publisher", topic="/numbers", type="Number", latch=latch)
     subscriber = make_node().subscriber("/numbers", Number, policy=reliable(8, 60.0))
+    stand_still(subscriber)
     child.ask(do="await_subscribers", topic="/numbers")
     child.ask(do="publish", topic="/numbers", count=5)
     values = []

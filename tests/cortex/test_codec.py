@@ -16,10 +16,13 @@ import pytest
 from hypothesis import given
 from random_schemas import any_message
 
+from cortex.body import Body
 from cortex.codec import MalformedMessage, Plan, codec_of
 from cortex.compiled import native
 from cortex.message_types import Array, Float32, Int8, Int32, UInt64, message
 from cortex.messages import Clock, Image, Imu, MotorCommand
+from cortex.native import make_coder
+from cortex.schema import schema_of
 
 
 class Mode(Enum):
@@ -90,8 +93,8 @@ def body_of(value: Any) -> bytes:
 
 def check_both_ways(value: Any) -> None:
     """All ways to write a message give the body of the reference, and all ways to read that the message."""
-    codec = codec_of(type(value))
-    body = Plan(codec._body, value).to_bytes()
+    codec, reference = codec_of(type(value)), Body(schema_of(type(value)), type(value))
+    body = Plan(reference, value).to_bytes()
     assert codec.encode(value, len(body)) == body
     assert codec.size(value) == len(body)
     assert codec.prepare(value, len(body)) == body
@@ -110,7 +113,7 @@ def check_both_ways(value: Any) -> None:
         codec.decode(body),
         codec.decode(frame, 6, len(body)),
         codec.decode(read_only, 6, len(body)),
-        codec._body.read(frame, 6, len(body)),
+        reference.read(frame, 6, len(body)),
     ):
         assert type(decoded) is type(value)
         assert decoded == value
@@ -121,7 +124,7 @@ def check_both_ways(value: Any) -> None:
 def test_messages_of_any_type(value):
     check_both_ways(value)
     if native is not None:  # it is C that has written and read each of them
-        coder, body = codec_of(type(value))._coder, body_of(value)
+        coder, body = make_coder(schema_of(type(value)), type(value)), body_of(value)
         assert coder.encode(value, len(body)) == body
         assert coder.decode(body, 0, len(body)) == value
 
@@ -205,9 +208,9 @@ def test_wrong_values_are_named(field, value, kind, text):
     """C, where it is there, neither writes nor raises: the words are those of Python."""
     codec = codec_of(Everything)
     wrong = everything(**{field: value})
-    if codec._coder is not None:
-        assert codec._coder.encode(wrong, 2**20) is None
-        assert codec._coder.encode(everything(), 2**20) is not None
+    if (coder := make_coder(codec.schema, codec.type)) is not None:
+        assert coder.encode(wrong, 2**20) is None
+        assert coder.encode(everything(), 2**20) is not None
     for attempt in (
         lambda: codec.encode(wrong, 2**20),
         lambda: codec.size(wrong),
@@ -354,7 +357,7 @@ def test_codecs_die_with_their_classes():
     assert codec.decode(bytes(8)).value == 0
     alive = weakref.ref(codec), weakref.ref(codec.type)
     del codec
-    for number in range(schema_module._CACHE_LIMIT):
+    for number in range(256):
         codec_of_schema(Schema(f"test/Passing{number}", (Field("value", "int64"),)))
     gc.collect()
     assert [reference() for reference in alive] == [None, None]

@@ -15,9 +15,9 @@ import zmq
 from cpp_client import Impostor, Peer, make_frame, publishers_in_cpp, subscribers_in_cpp
 from cpp_messages import Scan
 from cpp_programs import needs_compiler, programs, start
+from peer import stand_still
 from processes import SOON_S, wait_for
 
-import cortex.link
 from cortex import wire
 from cortex.codec import codec_of
 from cortex.compiled import native
@@ -72,9 +72,9 @@ def test_all_sizes_in_one_order(start, make_node, direction):
 
 
 @pytest.mark.parametrize("reason", ["no descriptor left for slots", "a reader without the C module"])
-def test_a_cpp_publisher_serves_its_reader_through_the_socket(start, make_node, monkeypatch, reason):
+def test_a_cpp_publisher_serves_its_reader_through_the_socket(start, make_node, request, reason):
     if "reader" in reason:
-        monkeypatch.setattr(cortex.link, "native", None)
+        request.getfixturevalue("sockets_alone")
     scans = make_node().subscriber("/scan", Scan, policy=reliable(64, SOON_S))
     start("publish", "/scan", 100, "100000,10", "" if "reader" in reason else "full")
     for number in range(100):
@@ -104,14 +104,12 @@ def test_stopped_reader_of_cpp_keeps_nothing_from_the_others(start, make_node, p
     wait_for(lambda: counted(node) == [9000])
 
 
+@pytest.mark.usefixtures("sockets_alone")
 @pytest.mark.parametrize("timeout_s", [0.05, 1.0])
-def test_reader_of_a_socket_that_stands_still_holds_up_a_cpp_publisher_once(
-    start, make_node, monkeypatch, timeout_s
-):
+def test_reader_of_a_socket_that_stands_still_holds_up_a_cpp_publisher_once(start, make_node, timeout_s):
     """After 8 MB, as one in Python: for a second, not for one with each large message."""
-    monkeypatch.setattr(cortex.link, "native", None)
     scans = make_node().subscriber("/scan", Scan, policy=reliable(1, timeout_s))
-    monkeypatch.setattr(scans, "top_up", lambda now_ns: None)  # the node does not read either
+    stand_still(scans)
     role = ("fill", "/scan", 200) if timeout_s < 1.0 else ("publish", "/scan", 40)
     begin_s = time.monotonic()
     writer = start(*role, 250_000)  # 1 MB each
@@ -166,10 +164,10 @@ def aux_of(frame: bytes) -> int:
     return int.from_bytes(frame[56:64], "little")
 
 
-def test_what_a_closed_cpp_publisher_has_taken_stays(start, make_node, monkeypatch):
+def test_what_a_closed_cpp_publisher_has_taken_stays(start, make_node):
     """Also when its process has ended, and nobody has read; behind it the number that tells of the loss."""
     scans = make_node().subscriber("/scan", Scan, policy=reliable(1, 0.01))
-    monkeypatch.setattr(scans, "top_up", lambda now_ns: None)  # the node does not read either
+    stand_still(scans)
     writer = start("fill", "/scan", 10**9, 2700)
     result = result_of(writer)
     writer.end()

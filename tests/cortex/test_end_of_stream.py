@@ -122,14 +122,13 @@ def expected(cut_off: int) -> dict[str, int]:
     return {name: sum(getattr(case, name) for case in cases) for name in COUNTERS}
 
 
-def test_python_reports_what_it_has_not_heard_the_end_of(leavers, monkeypatch):
-    monkeypatch.setattr(cortex.subscriber, "LEAVING_NS", 3 * 10**8)
+def test_python_reports_what_it_has_not_heard_the_end_of(leavers):
     with Node("reader", registry=leavers.tcp_registry) as node:
         readers = [node.subscriber(f"/cut{number}", Scan, policy=reliable()) for number in (0, 1)]
         leavers.speak()
         leavers.leave()
         for number, reader in enumerate(readers):
-            wait_for(lambda reader=reader: not reader.sources() and not reader._links)
+            wait_for(lambda reader=reader: not reader.sources() and not reader.carriers)
             take_all(reader)
             counted = {name: getattr(reader.counters, name) for name in COUNTERS}
             assert counted == expected(number), number

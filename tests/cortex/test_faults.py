@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 import pytest
-from peer import Block, accounted, is_whole, make_block, take
+from peer import Block, accounted, is_whole, make_block, slots_held, take
 from processes import SOON_S, Beside, fork_server, processes_with, shared_mappings, wait_for
 
 from cortex import keep_last, latest, reliable
@@ -66,11 +66,6 @@ def forks():
     return fork_server()
 
 
-def slots_held(publisher):
-    with publisher._pub_sockets.lock:
-        return publisher._fanout.ring._ring.leased()
-
-
 def goes_on(stream, count=20):
     """The stream publishes more."""
     before = stream.published
@@ -80,7 +75,7 @@ def goes_on(stream, count=20):
 def left(base, *subscribers):
     """How many files the nodes have, and how many descriptors and rings this process."""
     wait_for(lambda: len(list(base.glob("*/*.lock"))) <= 2)  # what a dead process had is swept
-    wait_for(lambda: not any(subscriber._links for subscriber in subscribers))
+    wait_for(lambda: not any(subscriber.carriers for subscriber in subscribers))
     return np.array([len(list(base.glob("*/*"))), len(os.listdir("/proc/self/fd")), len(shared_mappings())])
 
 

@@ -12,7 +12,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from peer import Block, Scan, accounted, connect, is_whole, make_block, take, take_all
+from peer import (
+    Block,
+    Scan,
+    accounted,
+    connect,
+    go_on,
+    is_whole,
+    make_block,
+    slots_held,
+    stand_still,
+    take,
+    take_all,
+    without_rings,
+)
 from processes import SOON_S, Beside, shared_mappings, wait_for
 
 import cortex.back_pressure
@@ -31,12 +44,6 @@ def scan(number, size=LARGE):
 
 def connected(node, kind, policy, **options):
     return connect(node, "/large", kind, policy, **options)
-
-
-def slots_held(publisher):
-    """Slots that any reader holds."""
-    with publisher._pub_sockets.lock:
-        return publisher._fanout.ring._ring.leased()
 
 
 def is_shared(message):
@@ -178,18 +185,19 @@ def test_messages_that_grow_and_shrink(node, policy, waiting):
     wait_for(lambda: len(shared_mappings()) < 12)  # the small ones are given up
 
 
-def test_who_comes_while_a_message_waits_for_room(node, monkeypatch):
+def test_who_comes_while_a_message_waits_for_room(node):
     """Its body lies in a slot: that ring is kept, and more slots are made for the next message."""
     size, options = 500_000, {"expected_bytes": 2_500_000, "max_wait_s": 60.0}
     publisher, subscriber = connected(node, Scan, reliable(1, 60.0), **options)
-    monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)  # the control thread does not read either
+    stand_still(subscriber)
     ring, count = publisher._fanout.ring._ring, 0
     while ring.patience(64) < 0:  # less than a frame that names a slot would find
         publisher.publish(scan(1, 3_000 if ring.patience(13_000) < 0 else 1))
         count += 1
     slots = ring.slots
     with Beside(publisher.publish, scan(2, size)) as waiting:
-        wait_for(lambda: publisher._back_pressure.is_waiting)
+        waiting.thread.join(0.2)
+        assert waiting.thread.is_alive()
         other = node.subscriber("/large", Scan, policy=reliable(1, 60.0))
         assert other.wait_for_publisher(timeout_s=SOON_S)
         for _ in range(count):
@@ -222,11 +230,10 @@ def test_memory_stays_flat(node):
     assert resident() - before < 8 << 20  # 1 kB each would be 12 MB; one large one leaked in eight, 300 MB
 
 
-def test_a_reader_without_shared_memory(node, monkeypatch):
+def test_a_reader_without_shared_memory(node):
     """It gets the same bytes; one that can share goes on sharing."""
     publisher, sharing = connected(node, Scan, reliable(8, 60.0))
-    with monkeypatch.context() as patch:
-        patch.setattr(cortex.link, "native", None)
+    with without_rings():
         plain = node.subscriber("/large", Scan, policy=reliable(8, 60.0))
         assert publisher.wait_for_subscribers(2, SOON_S)
         assert plain.wait_for_publisher(SOON_S)
@@ -239,9 +246,9 @@ def test_a_reader_without_shared_memory(node, monkeypatch):
     assert plain.counters.rejected == 0
 
 
-def test_sockets_send_a_body_from_memory_that_is_used_again(node, monkeypatch):
+@pytest.mark.usefixtures("sockets_alone")
+def test_sockets_send_a_body_from_memory_that_is_used_again(node):
     """No second copy of it is made, and nothing is allocated for it once one has been sent."""
-    monkeypatch.setattr(cortex.link, "native", None)
     publisher, subscriber = connected(node, Scan, reliable())
     message, peaks = scan(7, 1_000_000), []
     for _ in range(6):
@@ -270,30 +277,30 @@ def test_sockets_send_a_body_from_memory_that_is_used_again(node, monkeypatch):
     wait_for(lambda: is_given_back(after_s=11.0))
 
 
-def test_a_small_body_in_memory_of_a_larger_one_counts_as_that(node, monkeypatch):
+@pytest.mark.usefixtures("sockets_alone")
+def test_a_small_body_in_memory_of_a_larger_one_counts_as_that(node):
     """What waits for a reliable reader is bounded by the memory that it takes."""
-    monkeypatch.setattr(cortex.link, "native", None)
     publisher, subscriber = connected(node, Scan, reliable(1, 0.05))
     large = publisher._fanout.large
     bodies = [large.acquire(4_000_000) for _ in range(8)]
     bodies.clear()
     assert len(large._free) == 8
-    with subscriber._receive_lock:
-        for _ in range(10):
-            publisher.publish(scan(0, 300_000))  # 1.2 MB
+    stand_still(subscriber)
+    for _ in range(10):
+        publisher.publish(scan(0, 300_000))  # 1.2 MB
     held = sum(large._lent.values())
     assert 0 < held <= large.waiting_bytes[True] <= 8 << 20
     del bodies
 
 
+@pytest.mark.usefixtures("sockets_alone")
 @pytest.mark.parametrize("policy", [reliable(2, 0.05), keep_last(4)], ids=str)
 def test_what_waits_in_sockets_is_bounded(node, monkeypatch, policy):
     """A reader that reads nothing, large messages, no shared memory: memory does not grow for ever."""
-    monkeypatch.setattr(cortex.link, "native", None)
     monkeypatch.setattr(cortex.link, "QUEUE_MAX", 4)  # else all 60 may wait in its socket
     publisher, subscriber = connected(node, Scan, policy)
     message = scan(0, 1_000_000)
-    monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)  # the control thread does not read either
+    stand_still(subscriber)
     for _ in range(60):
         publisher.publish(message)
     assert sum(publisher._fanout.large.waiting_bytes.values()) <= 80 << 20
@@ -308,29 +315,32 @@ def test_what_waits_in_sockets_is_bounded(node, monkeypatch, policy):
     assert counters.lost + counters.overtaken > 0  # overtaken: read late, when newer ones were there
 
 
-def test_a_reader_of_a_socket_that_stands_still_holds_up_once(node, monkeypatch):
+@pytest.mark.usefixtures("sockets_alone")
+def test_a_reader_of_a_socket_that_stands_still_holds_up_once(node):
     """Not each large message, nor with each new reader; it goes on when it reads, and counts what it lost."""
-    monkeypatch.setattr(cortex.link, "native", None)
-    publisher, subscriber = connected(node, Scan, reliable(1, 0.05))
-    waits, wait_for_room = [], publisher._back_pressure.wait_for
+    patience_s = 0.5
+    publisher, subscriber = connected(node, Scan, reliable(1, patience_s))
+    delivered, took_s = [], []
 
-    def wait(*arguments):
-        waits.append(wait_for_room(*arguments))
-        return waits[-1]
+    def publish():
+        begin_s = time.monotonic()
+        delivered.append(publisher.publish(scan(len(delivered), 250_000)))
+        took_s.append(time.monotonic() - begin_s)
 
-    monkeypatch.setattr(publisher._back_pressure, "wait_for", wait)
-    with monkeypatch.context() as still:
-        still.setattr(subscriber, "top_up", lambda now_ns: None)
-        delivered = [publisher.publish(scan(number, 250_000)) for number in range(25)]
-        with node.subscriber("/large", Scan, policy=reliable(64, 0.0)):
-            assert publisher.wait_for_subscribers(2, SOON_S)
-            delivered += [publisher.publish(scan(number, 250_000)) for number in range(25, 30)]
+    stand_still(subscriber)
+    for _ in range(25):
+        publish()
+    with node.subscriber("/large", Scan, policy=reliable(64, 0.0)):
+        assert publisher.wait_for_subscribers(2, SOON_S)
+        for _ in range(5):
+            publish()
+    go_on(subscriber)
     assert delivered == [True] * sum(delivered) + [False] * delivered.count(False)
-    assert waits.count(False) == 1
+    assert sum(each_s >= patience_s for each_s in took_s) == 1
     received = []
 
     def goes_on():
-        delivered.append(publisher.publish(scan(len(delivered), 250_000)))
+        publish()
         received.extend(message.stamp_ns for message in take_all(subscriber))
         return delivered[-1]
 
@@ -367,7 +377,7 @@ def test_a_large_message_has_all_its_time_after_one_that_was_held_up(node, monke
     """Of another thread, whose turn came between this one's check and its own turn."""
     publisher, subscriber = connect(node, "/scans", Scan, reliable(1, SOON_S), max_wait_s=0.5)
     assert subscriber.wait_for_publisher(SOON_S)
-    monkeypatch.setattr(subscriber, "top_up", lambda now_ns: None)
+    stand_still(subscriber)
     fill_slots(publisher)
     lock = publisher._large_lock
 
@@ -389,12 +399,12 @@ def test_all_that_stand_still_hold_up_a_message_for_the_time_of_one(node, monkey
     """One reads the ring and has all slots, for one there is no memory: `max_wait_s` is that of a message."""
     publisher = node.publisher("/scans", Scan, max_wait_s=0.5)
     readers = []
-    for module in (cortex.link.native, None):
-        monkeypatch.setattr(cortex.link, "native", module)
-        readers.append(node.subscriber("/scans", Scan, policy=reliable(1, SOON_S)))
-        assert publisher.wait_for_subscribers(len(readers), SOON_S)
-        assert readers[-1].wait_for_publisher(SOON_S)
-        monkeypatch.setattr(readers[-1], "top_up", lambda now_ns: None)
+    for reading in (contextlib.nullcontext(), without_rings()):
+        with reading:
+            readers.append(node.subscriber("/scans", Scan, policy=reliable(1, SOON_S)))
+            assert publisher.wait_for_subscribers(len(readers), SOON_S)
+            assert readers[-1].wait_for_publisher(SOON_S)
+        stand_still(readers[-1])
     fill_slots(publisher)
     monkeypatch.setattr(cortex.large, "STRICT_BYTES", 0)
     waits_s = recorded_waits_s(monkeypatch)

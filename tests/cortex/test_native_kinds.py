@@ -17,13 +17,15 @@ import pytest
 from damage import mutate, outcome
 from hypothesis import given
 from hypothesis import strategies as st
+from peer import slots_held
 from processes import SOON_S, wait_for
 from random_schemas import any_message, schemas
 from test_codec import Everything, Level, Mode, Point, everything
-from test_large import connected, slots_held
+from test_large import connected
 from wire_vectors import load_vectors
 
 from cortex import reliable
+from cortex.body import Body
 from cortex.codec import Plan, codec_of
 from cortex.compiled import native
 from cortex.message_types import Array, message
@@ -36,7 +38,7 @@ pytestmark = pytest.mark.skipif(native is None, reason="cortex._native was not c
 
 def python_body(value: Any) -> bytes:
     """The body as the Python packer writes it."""
-    return Plan(codec_of(type(value))._body, value).to_bytes()
+    return Plan(Body(schema_of(type(value)), type(value)), value).to_bytes()
 
 
 def coder_of(cls: type) -> Any:
@@ -300,7 +302,7 @@ def is_accepted(codec: Any, body: bytes, bounded: bool = True) -> bool:
     framed = b"\xff" * 64 + body + b"\xff" * 64
     first = outcome(codec.decode, body)
     within = outcome(codec.decode, framed, 64, len(body))
-    general = outcome(codec._body.read, np.frombuffer(framed, np.uint8), 64, len(body))
+    general = outcome(Body(codec.schema, codec.type).read, np.frombuffer(framed, np.uint8), 64, len(body))
     said = (codec.schema.name, body.hex())
     assert (first is None) == (within is None) == (general is None), said
     if first is None:
@@ -318,7 +320,7 @@ def is_accepted(codec: Any, body: bytes, bounded: bool = True) -> bool:
 
 @given(any_message(), st.data())
 def test_damaged_bodies_of_any_type(value, data):
-    body = Plan(codec_of(type(value))._body, value).to_bytes()
+    body = python_body(value)
     is_accepted(codec_of(type(value)), mutate(data.draw(st.randoms()), body), bounded=False)
 
 

@@ -16,7 +16,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from random_schemas import schemas
 
-from cortex import schema as schema_module
 from cortex.codec import codec_of
 from cortex.message_types import Array, Unit, message
 from cortex.schema import (
@@ -261,9 +260,3 @@ def test_no_code_is_generated_from_a_schema(monkeypatch):
     monkeypatch.undo()
     assert cls(1, None, "x").s == "x"
     assert not any("wire" in text for text in texts)  # dataclasses runs an empty text, of no field
-
-
-def test_the_cache_of_classes_is_bounded():
-    for k in range(600):
-        type_from_schema(Schema(f"bounded/T{k}", (field(),)))
-    assert len(schema_module._classes) <= 256

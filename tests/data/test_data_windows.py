@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import yaml
@@ -9,7 +11,8 @@ from recorded_flights import HEIGHT, WIDTH, write_flight
 
 import neurosim_core as ns
 from neurosim_core import data
-from neurosim_core.data.sources import RunSource
+from neurosim_core.data.batch import FIELDS
+from neurosim_core.data.sources import RunSource, WorldsSource, fields_of
 from neurosim_core.data.windows import WindowConfig
 from neurosim_core.io.transfer import transfer
 from neurosim_core.packets import EventArrays
@@ -166,6 +169,44 @@ def test_a_run_and_its_recording_give_the_same(labels, tmp_path):
         same(one, two)
         assert one.flow.shape == (24, 32, 2)
         assert np.array_equal(one.flow, two.flow, equal_nan=True)
+
+
+def test_what_a_sensor_gives_is_what_its_recording_gives(tmp_path):
+    """Of every kind; ranges are depth and estimates are poses in a run, and in worlds, as in a recording."""
+    cameras = {"lens": LENS, "rate_hz": 20.0}
+    sensors: dict[str, Any] = {}
+    for kind, cls in ns.registry.kinds("sensor").items():
+        if not cls.__module__.startswith("neurosim_core.") or kind == "event_camera":
+            continue
+        settings = {name: value for name, value in cameras.items() if name in cls.model_fields}
+        sensors[kind] = {"kind": kind, **(settings if "lens" in settings and kind != "lidar" else {})}
+    sensors["grey"] = {"kind": "frame_camera", "color": "mono", **cameras}
+    sensors["raw"] = {"kind": "frame_camera", "bits": 12, **cameras}
+    config = ns.load_config({**CONFIG, "sensors": {"cam": CONFIG["sensors"]["cam"], **sensors}})
+    given = fields_of(config)
+    assert {name: field for name, field in given.items() if field is not None} == {
+        "cam": "events", "depth": "depth", "range": "depth", "rgb": "rgb", "frame_camera": "rgb",
+        "grey": "rgb", "optical_flow": "flow", "imu": "imu", "odometry": "pose", "state_estimate": "pose",
+    }  # fmt: skip
+    with RecordingWriter(tmp_path / "a.h5", RecordingHeader(config_yaml="", seed=0, version="0")) as out:
+        for packet in ns.run(config):
+            out.write(packet)
+    for name, field in given.items():
+        for other in FIELDS:
+            if other == field:
+                data.Dataset(tmp_path / "a.h5", sensors={other: name})
+            else:
+                with pytest.raises(ValueError, match=f"has no sensor '{name}' for {other}"):
+                    data.Dataset(tmp_path / "a.h5", sensors={other: name})
+    chosen = {"depth": "range", "rgb": "grey", "pose": "state_estimate"}
+    recorded = data.Dataset(tmp_path / "a.h5", sensors=chosen).read(0, 4)
+    del sensors["log_radiance"]  # of single runs
+    worlds = ns.load_config({**CONFIG, "sensors": {"cam": CONFIG["sensors"]["cam"], **sensors}})
+    for source in (RunSource(config), WorldsSource(ns.Simulation(worlds, worlds=1))):
+        for one, two in zip(source.samples(WindowConfig(sensors=chosen)), recorded, strict=True):
+            for field in chosen:
+                assert np.array_equal(getattr(one, field), getattr(two, field)), (source, field)
+            assert one.rgb.shape == (24, 32)
 
 
 def test_batches_of_worlds():

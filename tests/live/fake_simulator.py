@@ -13,6 +13,7 @@ from cortex import Node, Publisher
 from cortex import messages as msg
 from neurosim_core.config import load_config, to_yaml
 from neurosim_core.live import topics
+from neurosim_core.live.messages import message_type
 
 MS = 1_000_000
 WIDTH, HEIGHT = 32, 24
@@ -67,8 +68,10 @@ class FakeSimulator:
         self._status_count = 0
         self._announcements = self._publisher(topics.SIMULATION, msg.Simulation, latch=True)
         self.statuses = self._publisher(topics.STATUS, msg.SimulatorStatus)
-        kinds = {"dvs": msg.Events, "rgb": msg.Image, "z": msg.Image, "imu": msg.Imu}
-        self.sensors = {name: self._publisher(f"/drone/{name}", kind) for name, kind in kinds.items()}
+        self.sensors = {
+            name: self._publisher(f"/drone/{name}", message_type(sensor.packet_class))
+            for name, sensor in config.sensors.items()
+        }
         self.odometry = self._publisher("/drone/odometry", msg.Odometry, latch=True)
         self.rotor_speeds = self._publisher("/drone/rotor_speeds", msg.RotorSpeeds, latch=True)
         self.path = self._publisher("/drone/path", msg.Path, latch=True)

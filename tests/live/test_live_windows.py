@@ -15,6 +15,8 @@ from processes import SOON_S
 
 from neurosim_core import cli, data
 from neurosim_core.data.windows import WindowConfig
+from neurosim_core.record import Recording
+from neurosim_core.sensors.event_labels import LabelledEvents
 
 LENS = {"width": 32, "height": 24, "horizontal_fov_rad": 1.5}
 SETTINGS = {
@@ -24,7 +26,7 @@ SETTINGS = {
     "scene": {"kind": "apartment", "rooms": 1},
     "path": {"kind": "circle"},
     "sensors": {
-        "events": {"kind": "event_camera", "lens": LENS},
+        "events": {"kind": "event_camera", "lens": LENS, "labels": ["cause"]},
         "depth": {"kind": "depth", "rate_hz": 50.0, "lens": LENS},
         "imu": {"kind": "imu", "rate_hz": 200.0},
     },
@@ -68,3 +70,6 @@ def test_live_windows_are_those_of_the_recording(tmp_path):
         assert np.array_equal(sample.depth, other.depth)
         assert np.array_equal(sample.imu, other.imu)
         assert all(np.array_equal(a, b) for a, b in zip(sample.events, other.events, strict=True))
+    with Recording(tmp_path / "flown" / "flight.h5") as recording:
+        events = [packet for packet in recording.packets() if isinstance(packet, LabelledEvents)]
+    assert sum(len(packet.cause) for packet in events) > 20

@@ -20,16 +20,18 @@ import numpy as np
 import PIL.Image
 import pytest
 import trimesh
-from fake_simulator import HEIGHT, MS, ROTORS, WIDTH, FakeSimulator, make_events
+from fake_simulator import HEIGHT, MS, ROTORS, SENSORS, WIDTH, FakeSimulator, make_events
 from processes import SOON_S, wait_for
 from rerun_file import Rows, read, scalars
 
 from cortex import Node
 from cortex import messages as msg
 from neurosim_core.live import viewer as viewer_module
+from neurosim_core.live.messages import to_message, to_packet
 from neurosim_core.live.session import ViewOptions
 from neurosim_core.live.viewer import view, watch
 from neurosim_core.packets import EventArrays
+from neurosim_core.sensors.event_labels import LabelledEvents
 from neurosim_core.view.pictures import event_picture
 from neurosim_core.view.rerun_sdk import RerunFiles
 
@@ -183,6 +185,35 @@ def test_what_is_published_is_in_the_file(tmp_path, box, start):
     assert "| drone/dvs | on | 100 | 1 | 50 | 9 | 0 | 0 | 0 |" in text  # 50 windows in half a second
     assert "| drone/rgb | on | 100 | 1 | 50 | 9 | 0 | 2 | 0 |" in text
     assert "| drone/z | off | - | 1 | 50 | 9 | 0 | 0 | 0 |" in text
+
+
+def test_labelled_events_and_a_second_odometry_are_shown(tmp_path, box, start):
+    file = tmp_path / "live.rrd"
+    sensors = {
+        "dvs": {**SENSORS["dvs"], "labels": ["cause"]},
+        "imu": SENSORS["imu"],
+        "truth": {"kind": "odometry", "rate_hz": 10.0},
+    }
+    watcher = start(file, only=["dvs", "imu", "truth"])
+    with FakeSimulator(box, overrides={"sensors": sensors}) as simulator:
+        simulator.announce()
+        simulator.wait_for_cameras()
+        simulator.state(1)
+        still = {"orientation": np.array([0.0, 0.0, 0.0, 1.0]), "body_rate": np.zeros(3)}
+        state = {"position": np.ones(3), "velocity": np.array([0.0, 0.0, 2.0]), **still}
+        simulator.sensors["truth"].publish(msg.Odometry(stamp_ns=9 * MS, **state))
+        none = np.zeros(0, np.float32)
+        truth = {"depth": none, "flow": none.reshape(0, 2), "labels": "{}", "cause": np.zeros(40, np.uint8)}
+        truth |= {"instance": none.astype(np.int32), "semantic": none.astype(np.int32)}
+        for k in range(5):
+            labelled = LabelledEvents(**vars(to_packet(make_events(k), "dvs")) | truth)
+            simulator.sensors["dvs"].publish(to_message(labelled))
+        grows_to(file, lambda rows: f"{BODY}/dvs/image" in rows and "/plots/drone/truth/speed" in rows)
+    watcher.end()
+    rows = read(file)
+    assert scalars(rows, "/plots/drone/truth/speed") == [(9 * MS, [2.0])]
+    assert scalars(rows, "/plots/drone/odometry/speed") == [(5 * MS, [5.0])]
+    assert [t for t, _ in rows[f"{BODY}/dvs/image"]] == [20 * MS, 40 * MS]
 
 
 def test_a_link_that_is_set_in_flight_is_shown(tmp_path, box, start, monkeypatch):
