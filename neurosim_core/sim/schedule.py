@@ -14,8 +14,9 @@ from neurosim_core.clock import Rate
 
 TICKS_PER_INSTANT = 4
 """How many times as many ticks a batch takes of a group that renders only some of them."""
-STRETCH_COUNT_MAX = 4096
-"""Most stretches that are remembered; where clocks hardly ever tick together, no two are alike."""
+STRETCH_COUNT_MAX = 512
+"""Most stretches that are remembered, as many as graphs; where clocks hardly ever tick together, no two are
+alike."""
 _COMMON_MAX_NS = 10**13
 
 
