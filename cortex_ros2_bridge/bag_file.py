@@ -105,9 +105,10 @@ class BagWriter:
         routes, _ = make_routes(Seen((seen,)), BridgeConfig(backend=".mcap"))
         wide = max(getattr(message, "width", 0), getattr(message, "height", 0)) > EVT3_SIZE_MAX
         ways = []
+        has_events = any(route.ros_type in EVENT_TYPES for route in routes)
         for route in routes:
             rule = rule_of(route)
-            drawn = route.cortex_type == "cortex/Events" and route.ros_type not in EVENT_TYPES
+            drawn = has_events and route.ros_type == "sensor_msgs/msg/Image"
             if drawn or route.ros_type == "sensor_msgs/msg/CameraInfo":  # nobody gives a calibration
                 continue
             options = {

@@ -83,8 +83,8 @@ class Outgoing:
         """Convert a message and publish it."""
         tally = self.tally
         tally.count("received")
-        if isinstance(message, Events) and message.dropped_count:
-            tally.count("dropped", "events that did not fit into the sensor's buffer", message.dropped_count)
+        if dropped := getattr(message, "dropped_count", 0):
+            tally.count("dropped", "events that did not fit into the sensor's buffer", dropped)
         if self.whereabouts is not None:
             self.context.max_thrust_n = self.whereabouts.max_thrust_n
         try:

@@ -198,7 +198,8 @@ def odometry_of(vehicle: str, seen: Seen) -> str | None:
 
 def _candidates(seen: Seen, config: BridgeConfig) -> list[tuple[Route, Rule]]:
     found = []
-    pictures = {t.topic for t in seen.topics if t.type_name in ("cortex/Image", "cortex/Events")}
+    calibrated = {rule.cortex_type for rule in rules() if rule.ros_type == "sensor_msgs/msg/CameraInfo"}
+    pictures = {t.topic for t in seen.topics if t.type_name in calibrated - {"cortex/CameraInfo"}}
     for topic in seen.topics:
         if not _is_known(topic):
             continue

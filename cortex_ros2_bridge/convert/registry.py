@@ -15,6 +15,7 @@ fields all have a counterpart in ROS, goes out field by field without any regist
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import importlib.metadata
@@ -49,7 +50,6 @@ LATCHED = Qos(durability="transient_local", depth=1)
 Direction = Literal["out", "in", "call", "record"]
 """out: Cortex to ROS; in: ROS to Cortex; call: a message of ROS becomes a request to a Cortex service;
 record: commands in Cortex go into bags, as the messages of ROS that would give them."""
-_EVENT_PACKET = "event_camera_msgs/msg/EventPacket"
 _EVENT_FIELDS = frozenset(field.name for field in fields(messages.Events))
 """What events with more than that, such as their truth, have too."""
 F = TypeVar("F", bound=Callable[..., Any])
@@ -230,9 +230,10 @@ def _rules_of(plain: Any) -> Iterable[Rule]:
     name, fields_of = plain["name"], {field["name"] for field in plain["fields"]}
     known = MEASUREMENTS.get(name)
     if fields_of >= _EVENT_FIELDS:
-        yield Rule(
-            name, _EVENT_PACKET, "out", "{topic}", PACKETS, _conversion_of("cortex/Events", _EVENT_PACKET)
-        )
+        yield from (r._replace(cortex_type=name) for r in RULES if r[:1] + r[2:3] == ("cortex/Events", "out"))
+        with contextlib.suppress(ValueError):  # what ROS has no counterpart of stays in Cortex
+            ros_type = _define(plain, None)
+            yield Rule(name, ros_type, "out", "{topic}/labelled", PACKETS, _writer(plain, ros_type))
     elif _is_picture(plain):
         yield from _picture_rules(plain)
     elif known is not None and known.fields <= fields_of:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from neurosim_core.io.event_file import EventFileError, EventSource, choose_topic, gather_blocks
 from neurosim_core.packets import PACKET_CLASSES, EventArrays, Events, Packet
+from neurosim_core.registry import kinds
 
 
 class LogSource(EventSource):
@@ -23,17 +24,15 @@ class LogSource(EventSource):
             raise EventFileError(str(error)) from None
         self.notes = [f"{path}: {self._log.cut}"] if self._log.cut else []
         known = _message_types()
-        self._types = {
-            entry.topic: known[entry.schema.name]
-            for entry in self._log.topics
-            if entry.schema.name in known and entry.topic.count("/") == 2
-        }
+        topics = [entry for entry in self._log.topics if entry.topic.count("/") == 2]
+        found = {entry.topic: known[entry.schema.name] for entry in topics if entry.schema.name in known}
+        self._types = {topic: kind for topic, (kind, _) in found.items()}
+        self._cameras = [topic for topic, (_, packet) in found.items() if issubclass(packet, Events)]
         self._sensor = sensor
 
     def begin(self) -> None:
         """Choose the camera, and with it the vehicle."""
-        cameras = [topic for topic, kind in self._types.items() if kind.__name__ == "Events"]
-        self._topic = choose_topic(self._path, cameras, self._sensor)
+        self._topic = choose_topic(self._path, self._cameras, self._sensor)
         self._vehicle = self._topic.rpartition("/")[0]
         first = next((packet for packet in self.packets() if isinstance(packet, Events)), None)
         self.size = (first.width, first.height) if first else (1, 1)
@@ -66,14 +65,15 @@ class LogSource(EventSource):
         self._log.close()
 
 
-def _message_types() -> dict[str, type]:
-    """Return the message type of each packet class that has one, by its name."""
+def _message_types() -> dict[str, tuple[type, type[Packet]]]:
+    """Return the message type of each packet class that has one, and that class, by the name of the type."""
     from cortex.schema import schema_of
     from neurosim_core.live.messages import message_type
 
+    kinds("sensor")  # a class is known once its module is imported
     types = {}
     for packet in PACKET_CLASSES.values():
         with contextlib.suppress(TypeError):  # arrays without axes: no message can carry it
             kind = message_type(packet)
-            types[schema_of(kind).name] = kind
+            types[schema_of(kind).name] = kind, packet
     return types

@@ -13,8 +13,9 @@ from neurosim_core.learn.task import Task
 from neurosim_core.runtime.cuda import RecordedLaunch
 
 _LEFT_OUT = {  # what never changes, what each step writes before it reads it, and what is of this process
-    "_scenes", "_model", "_routes", "_observations", "observation", "_status", "buffers",
-    "slots", "graphs", "results", "stack", "pictures", "shared_pictures", "_offsets_ns", "_hosts",
+    "_scenes", "_model", "_schedule", "_routes", "_observations", "observation", "_status", "buffers",
+    "slots", "pipeline", "results", "stack", "_frames", "pictures", "shared_pictures", "_offsets_ns",
+    "_hosts",
 }  # fmt: skip
 
 Place = tuple[str, Any, str, Any]

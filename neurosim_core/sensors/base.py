@@ -405,10 +405,13 @@ class FrameSensor(ABC):
     def plan(self, frames: Any, stamps_ns: Sequence[int], end_ns: int) -> Launches | None:
         """Return what makes something of the frames of a batch; None: nothing is to be done.
 
+        Keys of launches tell those of this sensor apart; other sensors may have the same.
+
         Args:
             frames: Log radiance, device array of float32, shape [N K, H, W]; stays as it is until the batch
                 has been read. It is there when the launches run.
-            stamps_ns: Times of the first frames of each world [ns], at most K, increasing.
+            stamps_ns: Times of the first frames of each world [ns], at most K, increasing. There may be none,
+                in a run also before `begin`.
             end_ns: End of the batch [ns].
         """
 

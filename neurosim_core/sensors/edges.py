@@ -50,6 +50,7 @@ class EdgesConfig(EdgeLimits, ImageSensorConfig):
     kind: Literal["edges"] = "edges"
 
     packet_type = LabelImage
+    is_overlay = True
     output = "instance"
     encoding = "32SC1"
 

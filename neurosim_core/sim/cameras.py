@@ -139,7 +139,10 @@ def plan_job(state: State, batch: Batch, index: int, places: Sequence[int]) -> R
         image_slots.append(used if due else -1)
         used += bool(due)
     posed, placed = slots, tuple(image_slots)
-    pattern: Hashable | None = (id(group), buffer_index, posed, placed) if group.only_launches else None
+    pattern: Hashable | None = None
+    if group.only_launches:
+        taken = tuple((slot, name) for _, slot, name in pictures)  # each has launches of its own
+        pattern = (id(group), buffer_index, posed, placed, taken)
     if group.world_count > 1:  # frustum candidate lists look at all instants of a world
         posed += (slots[-1],) * (group.capacity - len(slots))
     buffers = group.buffers[buffer_index]
@@ -251,7 +254,7 @@ def plan_scans(state: State, batch: Batch) -> list[Launches]:
     Those that have no reference, and all where worlds begin, take the first frame as one.
     """
     jobs = {id(job.group): job for job in batch.jobs or ()}
-    scans: list[Launches | None] = []
+    scans: list[Launches] = []
     for group in state.groups:
         job = jobs.get(id(group))
         buffers, stamps_ns = (group.buffers[0], []) if job is None else (job.buffers, job.stamps_ns)
@@ -263,9 +266,10 @@ def plan_scans(state: State, batch: Batch) -> list[Launches]:
                 mask = state.worlds.active if batch.begins is None else batch.begins
                 scans.append(Launches(None, partial(_begin, sensor, frames, stamps_ns, batch.until_ns, mask)))
                 group.watching.add(name)
-            else:
-                scans.append(sensor.plan(frames, stamps_ns, batch.until_ns))
-    return [scan for scan in scans if scan is not None]
+            elif (scan := sensor.plan(frames, stamps_ns, batch.until_ns)) is not None:
+                key = None if scan.key is None else (name, scan.key)  # sensors of a kind have equal keys
+                scans.append(scan._replace(key=key))
+    return scans
 
 
 def _begin(sensor: FrameSensor, frames: Any, stamps_ns: Sequence[int], end_ns: int, mask: Any) -> None:

@@ -14,8 +14,9 @@ from neurosim_core.clock import Rate
 
 TICKS_PER_INSTANT = 4
 """How many times as many ticks a batch takes of a group that renders only some of them."""
-STRETCH_COUNT_MAX = 4096
-"""Most stretches that are remembered; where clocks hardly ever tick together, no two are alike."""
+STRETCH_COUNT_MAX = 512
+"""Most stretches that are remembered, as many as graphs; where clocks hardly ever tick together, no two are
+alike."""
 _COMMON_MAX_NS = 10**13
 
 
@@ -124,11 +125,12 @@ class Schedule:
     def stretch(self, start_ns: int, end_ns: int) -> Stretch:
         """Return what happens in (start_ns, end_ns], in order of time; the last boundary is at `end_ns`."""
         key = (start_ns % self.common_ns if self.common_ns else start_ns, end_ns - start_ns)
-        if key not in self._stretches:
+        stretch = self._stretches.get(key)
+        if stretch is None:
             if len(self._stretches) >= STRETCH_COUNT_MAX:
                 self._stretches.clear()
-            self._stretches[key] = self._make_stretch(start_ns, end_ns)
-        return self._stretches[key]
+            stretch = self._stretches[key] = self._make_stretch(start_ns, end_ns)
+        return stretch
 
     def _make_stretch(self, start_ns: int, end_ns: int) -> Stretch:
         marks = {end_ns: 0}

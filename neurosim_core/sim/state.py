@@ -220,6 +220,7 @@ def make_state(
     trace = Trace(
         surfaces,
         world_arrays,
+        vehicle,
         capacity=slot_count,
         history_length=_history_length(model, slot_count + worlds.slot_count),
         on_host=on_host,

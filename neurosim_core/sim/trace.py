@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from neurosim_core.runtime.cuda import HostCopy, RecordedLaunch
 from neurosim_core.scene.freespace import DistanceField, clearance_around
 from neurosim_core.vehicle.arrays import BLOCK_DIM, STATUS_COLLISION, STATUS_OK, MultirotorArrays
-from neurosim_core.vehicle.base import FlightKernel, Vehicle
+from neurosim_core.vehicle.base import Vehicle
 from neurosim_core.vehicle.history import History, append_history, make_history, motion_at
 
 wp.set_module_options({"enable_backward": False})
@@ -210,7 +210,8 @@ class Trace:
 
     Args:
         surfaces: What vehicles can touch.
-        worlds: The vehicles.
+        worlds: The vehicles and their clocks as kernels see them.
+        vehicle: What moves them.
         capacity: Number of slots.
         history_length: How many boundaries are kept for cameras, at least as many as there are slots.
         on_host: Slots are brought to the host, too: see `fetch`.
@@ -220,7 +221,14 @@ class Trace:
     """
 
     def __init__(
-        self, surfaces: Any, worlds: Any, *, capacity: int, history_length: int, on_host: bool = True
+        self,
+        surfaces: Any,
+        worlds: Any,
+        vehicle: Vehicle,
+        *,
+        capacity: int,
+        history_length: int,
+        on_host: bool = True,
     ) -> None:
         world_count, rotor_count = worlds.vehicles.rotor_speed.shape
         self.device = worlds.clock_ns.device
@@ -240,8 +248,10 @@ class Trace:
         for name, copy in zip(TraceRows._fields, self._copies, strict=False):
             setattr(self._rows_on_host, name, copy.mapped())
         self._record = self._recorded(_record)
-        self._vehicle: Vehicle | None = None
-        self._flight: FlightKernel | None = None
+        self._vehicle = vehicle
+        self._flight = vehicle.flight_kernel(record_state)
+        if self._flight is not None:
+            self._fly = self._recorded(self._flight.kernel)
         self._poses: dict[int, RecordedLaunch] = defaultdict(lambda: self._recorded(_camera_poses))
         """By the address of the poses: that of the buffers of one batch in flight."""
 
@@ -258,17 +268,13 @@ class Trace:
         arguments = [self._context, slot, elapsed_ns, int(first), int(last)]
         self._record.launch(self.arrays.states.shape[1], arguments)
 
-    def joins_spans(self, vehicle: Vehicle) -> bool:
-        """Return whether a vehicle records its state on the way: several spans are one launch."""
-        if vehicle is not self._vehicle:
-            self._vehicle, self._flight = vehicle, vehicle.flight_kernel(record_state)
-            if self._flight is not None:
-                self._fly = self._recorded(self._flight.kernel)
+    @property
+    def joins_spans(self) -> bool:
+        """Whether vehicles record their state on the way: several spans are one launch."""
         return self._flight is not None
 
     def advance(
         self,
-        vehicle: Vehicle,
         slot: int,
         elapsed_ns: int,
         span_ns: int,
@@ -282,13 +288,12 @@ class Trace:
         Slots are those from `slot` on, and `elapsed_ns` is the time before the first span. `first`: a batch
         begins with it; `last`: a batch ends with the last span.
         """
-        if self.joins_spans(vehicle) and span_ns > 0:
-            assert self._flight is not None
+        if self._flight is not None and span_ns > 0:
             arguments = [self._context, count, slot, elapsed_ns, int(first), int(last)]
-            self._fly.launch(vehicle.count, [*self._flight.inputs(span_ns), *arguments], key=span_ns)
+            self._fly.launch(self._vehicle.count, [*self._flight.inputs(span_ns), *arguments], key=span_ns)
             return
         if span_ns > 0:
-            vehicle.advance(span_ns)
+            self._vehicle.advance(span_ns)
         self.record(slot, elapsed_ns + span_ns, first=first, last=last)
 
     def camera_poses(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from processes import SOON_S, wait_for
@@ -12,35 +14,72 @@ from recording_backend import RecordingBackend
 
 from cortex import Node
 from cortex import messages as msg
-from cortex_ros2_bridge.bridge import Bridge
+from cortex_ros2_bridge import bridge, incoming, outgoing, tally
 from cortex_ros2_bridge.config import load
+
+
+class Clock:
+    """The module `time` of the bridge, whose monotonic clock can be put forward, and stopped."""
+
+    def __init__(self) -> None:
+        self._stopped_s: float | None = None
+        self._ahead_s = 0.0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(time, name)
+
+    def monotonic(self) -> float:
+        return self._ahead_s + (time.monotonic() if self._stopped_s is None else self._stopped_s)
+
+    def stop(self) -> None:
+        """Let time pass only where it is put forward."""
+        self._stopped_s = time.monotonic()
+
+    def put_forward(self, span_s: float) -> None:
+        self._ahead_s += span_s
 
 
 class Rig:
     """Everything in one process; `update_until` is the bridge's clockwork."""
 
     def __init__(self, settings: Any = None) -> None:
+        self._patches = contextlib.ExitStack()
+        self.clock = Clock()
+        for module in (bridge, incoming, outgoing, tally):
+            self._patches.enter_context(mock.patch.object(module, "time", self.clock))
         self.backend = RecordingBackend()
         self.simulator = Node("simulator")
-        self._node = Node("bridge")
+        self.node = Node("bridge")
         try:
-            self.bridge = Bridge(load(settings), self.backend, self._node)
+            self.bridge = bridge.Bridge(load(settings), self.backend, self.node)
         except BaseException:
-            self._node.close()
+            self.node.close()
             self.simulator.close()
+            self._patches.close()
             raise
 
-    def update_until(self, condition: Callable[[], object], timeout_s: float = SOON_S) -> Any:
+    def update_until(
+        self, condition: Callable[[], object], timeout_s: float = SOON_S, *, every_s: float = 0.0
+    ) -> Any:
+        """Let the bridge look until something holds, with its clock put forward before each look."""
+
         def look() -> object:
+            self.clock.put_forward(every_s)
             self.bridge.update()
             return condition()
 
         return wait_for(look, timeout_s)
 
-    def updates_during(self, count: int = 20) -> None:
-        """Let the bridge look some times."""
+    def updates_during(self, count: int = 20, *, every_s: float = 0.0) -> None:
+        """Let the bridge look some times, with its clock put forward before each look."""
         for _ in range(count):
+            self.clock.put_forward(every_s)
             self.bridge.update()
+
+    def has_seen(self, name: str, **values: Any) -> bool:
+        """Whether the bridge knows something of a vehicle: `now_ns`, `max_thrust_n`."""
+        vehicle = self.bridge._connections._vehicles[name]
+        return all(getattr(vehicle, what) == value for what, value in values.items())
 
     def opens(self, *topics: str) -> list[Any]:
         """Wait until the bridge publishes ROS topics."""
@@ -59,11 +98,6 @@ class Rig:
             self.update_until(lambda: publisher.subscriber_count == 1)
             yield found
 
-    def reminded(self, topic: str) -> bool:
-        """Whether the last message of a latched topic has been repeated for all who came."""
-        feeds = self.bridge._connections.feeds.values()
-        return not any(o._remind_s for f in feeds for o in f._outputs if o.route.ros_topic == topic)
-
     def has_calibration(self, topic: str) -> bool:
         """Whether the calibration that goes with each picture has come to what publishes on a topic."""
         feeds = self.bridge._connections.feeds.values()
@@ -75,8 +109,9 @@ class Rig:
 
     def close(self) -> None:
         self.bridge.close()
-        self._node.close()
+        self.node.close()
         self.simulator.close()
+        self._patches.close()
 
 
 @contextlib.contextmanager

@@ -300,13 +300,13 @@ def test_the_bridge_records_the_commands_of_others(monkeypatch: pytest.MonkeyPat
             said = rig.simulator.publisher("/simulation", msg.Simulation, latch=True)
             said.publish(simulation)
             commands = rig.simulator.publisher("/drone/command/rates", msg.RateThrustCommand)
-            rig.update_until(lambda: {topic.topic for topic in look(rig._node).topics} >= RECORDED)
+            rig.update_until(lambda: {topic.topic for topic in look(rig.node).topics} >= RECORDED)
             rig.updates_during()
             assert ("/drone/attitude_target" in rig.backend.publishers) == opened
             if not opened:
                 continue
             with rig.listening(commands, "/drone/attitude_target") as (target,):
-                rig.update_until(lambda: rig.bridge._connections._vehicles["drone"].max_thrust_n == 25.0)
+                rig.update_until(lambda: rig.has_seen("drone", max_thrust_n=25.0))
                 commands.publish(COMMANDS["rates"])
                 (told,) = rig.update_until(target.messages)
         assert (told.type_mask, told.thrust, told.body_rate.y) == (128, 0.5, -2.0)

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,13 +16,14 @@ from bridge_rig import rig_of
 from processes import ROOT, wait_for
 
 from cortex import Array, Float32, UInt8, message
-from cortex.messages import Events
+from cortex.messages import CameraInfo
 from cortex_ros2_bridge import cdr, cli
 from cortex_ros2_bridge.convert import registry
 from cortex_ros2_bridge.convert.registry import load_converters, ros_type_of, share
 from cortex_ros2_bridge.msgs import message_class
 from cortex_ros2_bridge.typestore import typestore
 from neurosim_core.live import messages as live
+from neurosim_core.sensors.event_labels import LabelledEvents
 
 EXAMPLE = ROOT / "examples" / "ros2_custom_type"
 
@@ -156,17 +157,44 @@ def test_a_picture_of_any_type_goes_out_as_an_image_with_what_its_labels_mean() 
     assert (image.header.stamp.sec, image.header.frame_id, text.data) == (3, "c", picture.labels)
 
 
-def test_events_with_their_truth_go_out_as_events() -> None:
-    """Whatever else a message of events has, it is packed as one."""
-    fields = get_type_hints(Events, include_extras=True)
-    more = type(
-        "More", (), {"__annotations__": {**fields, "depth": Array["float32", "m"]}, "__doc__": "More."}
+def test_events_with_their_truth_go_out_as_events_and_with_it() -> None:
+    """What others know is there as of any camera, its losses counted; the truth is beside it."""
+    columns = {
+        "t": np.array([4001, 4500]),
+        "x": np.array([1, 2], np.uint16),
+        "y": np.array([3, 4], np.uint16),
+    }
+    columns |= {"polarity": np.array([0, 1], np.uint8), "instance": np.array([7, -1], np.int32)}
+    columns |= {"depth": np.array([1.5, np.inf], np.float32), "cause": np.array([0, 3], np.uint8)}
+    columns |= {"flow": np.array([[1, 2], [3, 4]], np.float32), "semantic": np.array([2, -1], np.int32)}
+    header = {"stamp_ns": 5_000_000, "start_ns": 4_000_000, "sensor": "events", "width": 8, "height": 6}
+    events = LabelledEvents(**header, **columns, dropped_count=2, labels='{"classes":[]}')
+    names = ("", "/labelled", "/image", "/camera_info")
+    with rig_of() as rig:
+        sent = rig.simulator.publisher("/drone/events", live.message_type(LabelledEvents))
+        info = rig.simulator.publisher("/drone/events/info", CameraInfo, latch=True)
+        lens = {"matrix": np.eye(3), "distortion_model": "", "distortion": np.zeros(0)}
+        info.publish(CameraInfo(stamp_ns=0, width=8, height=6, **lens))
+        packets, labelled, image, calibration = rig.opens(*(f"/drone/events{name}" for name in names))
+        assert (packets.type_name, image.type_name, calibration.type_name) == (
+            "event_camera_msgs/msg/EventPacket", "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo",
+        )  # fmt: skip
+        assert labelled.type_name == "neurosim/msg/LabelledEvents"
+        with rig.listening(sent, "/drone/events", "/drone/events/labelled"):
+            sent.publish(live.to_message(events, frame_id="drone/events"))
+            wait_for(lambda: packets.sent and labelled.sent)
+        packet, truth = packets.messages()[0], labelled.messages()[0]
+        assert rig.tally("/drone/events -> /drone/events").dropped == 2
+        assert rig.bridge.problems == []
+    assert (packet.width, packet.height, packet.encoding, packet.header.frame_id) == (
+        8,
+        6,
+        "evt3",
+        "drone/events",
     )
-    kind = message(more, name="my_robot/More")
-    schema = registry.schema_of(kind)
-    assert registry.adopt(schema.to_json(), schema.fingerprint) == ""
-    (rule,) = registry.ADDED["my_robot/More"].rules
-    assert (rule.ros_type, rule.name) == ("event_camera_msgs/msg/EventPacket", "{topic}")
+    for name in columns:
+        np.testing.assert_array_equal(np.reshape(getattr(truth, name), columns[name].shape), columns[name])
+    assert (truth.labels, list(truth.flow_shape), truth.dropped_count) == (events.labels, [2, 2], 2)
 
 
 def test_a_type_without_counterparts_has_no_route() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -349,16 +350,13 @@ def test_choice(fake: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_choice_without_ros(dds_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     if HAS_RCLPY:
-        monkeypatch.setitem(__import__("sys").modules, "rclpy", None)
+        monkeypatch.setitem(sys.modules, "rclpy", None)
     node = open_backend("auto", distro="jazzy")
     assert node.name == "dds"
     node.close()
     with pytest.raises(BackendError, match="rclpy cannot be imported: source the setup file"):
         open_backend("rclpy")
-    real = importlib.util.find_spec
-    monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *rest: None if name == "cyclonedds" else real(name, *rest)
-    )
+    monkeypatch.setitem(sys.modules, "cyclonedds", None)
     with pytest.raises(BackendError, match=r"pip install 'cyclonedds.*3\.14 and ARM"):
         open_backend("auto")
 

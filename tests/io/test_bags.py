@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +14,16 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from cortex.log import LogWriter
 from cortex_ros2_bridge.typestore import typestore
 from neurosim_core import cli
 from neurosim_core.data import Dataset
 from neurosim_core.io import EventFileError, open_events
+from neurosim_core.live.messages import to_message
 from neurosim_core.packets import Events, Image, ImuSample, Odometry
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter
+from neurosim_core.sensors.barometer import Pressure
+from neurosim_core.sensors.event_labels import LabelledEvents
 
 WIDTH, HEIGHT, STEP_NS = 64, 48, 10_000_000
 BEGIN_NS = 17_000_000_000
@@ -63,6 +70,35 @@ def fly(path: Path) -> Path:
 
 def convert(*arguments: object) -> int:
     return cli.main(["convert", *map(str, arguments)])
+
+
+def test_a_log_of_cortex_has_labelled_events(tmp_path):
+    """Also where nothing has imported their class, nor that of another sensor."""
+    columns = {
+        "t": np.array([4001, 4500]),
+        "x": np.array([1, 2], np.uint16),
+        "y": np.array([3, 4], np.uint16),
+    }
+    columns |= {"polarity": np.array([0, 1], np.uint8), "depth": np.array([1.5, np.inf], np.float32)}
+    none = {
+        "instance": np.zeros(0, np.int32),
+        "semantic": np.zeros(0, np.int32),
+        "cause": np.zeros(0, np.uint8),
+    }
+    header = {"stamp_ns": 5_000_000, "start_ns": 4_000_000, "width": WIDTH, "height": HEIGHT, "labels": "{}"}
+    events = LabelledEvents(**header, **columns, **none, flow=np.zeros((0, 2), np.float32))
+    with LogWriter(tmp_path / "log.mcap") as log:
+        log.write("/drone/cam", to_message(events), 1)
+        log.write("/drone/air", to_message(Pressure(stamp_ns=5_000_000, pressure_pa=1e5)), 2)
+    words = [sys.executable, "-m", "neurosim_core", "convert", "log.mcap", "log.h5"]
+    environment = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[1])}
+    subprocess.run(words, cwd=tmp_path, env=environment, check=True, timeout=120)
+    with Recording(tmp_path / "log.h5") as recording:
+        kept = [*recording.packets()]
+    assert sum(packet.pressure_pa for packet in kept if isinstance(packet, Pressure)) == 1e5
+    (found,) = (packet for packet in kept if isinstance(packet, Events))
+    for name in ("t", "x", "y", "polarity"):
+        np.testing.assert_array_equal(getattr(found, name), columns[name])
 
 
 @pytest.mark.parametrize("name", ["flight.mcap", "bag", "flight.sqlite3"])

@@ -177,6 +177,13 @@ def test_a_state_is_taken_up_where_steps_differ_in_length(make):
         assert all(torch.equal(seen[name], value) for name, value in expected.items())
 
 
+def test_what_each_step_renders_is_not_saved(make):
+    """Frames of all worlds are more than all the rest."""
+    env = make()
+    roll(env, actions_of(2, 3))
+    assert not [path for path in env.state_dict() if path.endswith("._frames")]
+
+
 def test_what_sensors_remember_elsewhere_is_not_saved(make):
     noisy = {"pixel": {"threshold_on": 0.2, "threshold_off": 0.2, "shot_noise": {"rate_hz": 5.0}}}
     env = make(task=type("Noisy", (Brief,), noisy)(), randomise=False)

@@ -5,23 +5,24 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pytest
-from live_rig import ODOMETRY, LiveRig, make_config
+import warp as wp
+from live_rig import LiveRig, make_config
 from numpy.typing import NDArray
 from processes import SOON_S
 
 from cortex import Node, reliable
 from cortex import messages as msg
 from cortex.schema import schema_of
-from neurosim_core import sim
 from neurosim_core.live.config import LinkConfig
 from neurosim_core.live.messages import command_of, message_type, setpoint_of, to_message, to_packet
 from neurosim_core.live.topics import COMMANDS
 from neurosim_core.packets import Collision, Delivery, Events, FieldSpec, Image, ImuSample, Odometry, Packet
-from neurosim_core.sensors.odometry import OdometrySensorConfig
+from neurosim_core.registry import register
+from neurosim_core.sensors import RateHz, Sampler, SamplerContext, StateSensorConfig
 
 HEADER: dict[str, Any] = {"stamp_ns": 5_000_000, "sequence": 7, "sensor": "x"}
 
@@ -144,19 +145,36 @@ def test_an_unknown_mode_is_refused():
         command_of("warp", [1.0], stamp_ns=0)
 
 
-def test_a_new_packet_is_published_under_the_topic_of_its_sensor(
-    shared_runtime: Any, monkeypatch: pytest.MonkeyPatch
-):
-    """Odometry stands in for a sensor of a new kind: nothing in the live stack knows its packets."""
-    config = make_config(sensors={"scanner": ODOMETRY | {"rate_hz": 200.0}}, **{"live.mode": "lockstep"})
-    monkeypatch.setattr(OdometrySensorConfig, "packet_type", RangeScan)
-    end_step = sim.end_step
+@register("sensor", "test_scanner")
+class ScannerConfig(StateSensorConfig):
+    """A sensor of a new kind."""
 
-    def with_scans(*arguments: Any) -> list[Packet]:
-        found = end_step(*arguments)
-        return [a_scan(stamp_ns=p.stamp_ns, sequence=p.sequence, sensor="scanner") for p in found]
+    kind: Literal["test_scanner"] = "test_scanner"
+    rate_hz: RateHz = 200.0
 
-    monkeypatch.setattr(sim, "end_step", with_scans)
+    packet_type = RangeScan
+
+    def make(self, context: SamplerContext) -> Sampler:
+        return Scanner(context)
+
+
+class Scanner(Sampler):
+    """It measures nothing, and gives the same each time."""
+
+    def __init__(self, context: SamplerContext) -> None:
+        shape = (context.slot_count, context.vehicle.count)
+        self.arrays = {"nothing": wp.zeros(shape, dtype=float, device="cpu")}
+
+    def measure(self, slot: int) -> None:
+        pass
+
+    def packet(self, rows: Any, **header: Any) -> Packet:
+        return a_scan(**header)
+
+
+def test_a_new_packet_is_published_under_the_topic_of_its_sensor(shared_runtime: Any):
+    """Nothing in the live stack knows the sensor or its packets."""
+    config = make_config(sensors={"scanner": {"kind": "test_scanner"}}, **{"live.mode": "lockstep"})
     with LiveRig(config) as rig:
         scans = rig.listen("/drone/scanner", message_type(RangeScan))
         rig.fly(rig.listen("/drone/odometry", msg.Odometry), 3)

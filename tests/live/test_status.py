@@ -9,13 +9,14 @@ import json
 import logging
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from live_rig import IMU, LiveRig, make_config
+from live_rig import IMU, LiveRig, before_looks, make_config
 from processes import SOON_S
 from rich.console import Console
 
@@ -31,7 +32,6 @@ from cortex.messages import (
     VehicleStatus,
 )
 from neurosim_core.config import load_config
-from neurosim_core.live import streaming
 from neurosim_core.live.serve import StatusLine, serve
 from neurosim_core.record import Recording
 
@@ -156,21 +156,14 @@ def test_the_line_names_who_holds_it_up():
     text = io.StringIO()
     with line_on(text) as line:
         line.show(status)
-        shown = str(line._line.status)
+    shown = " ".join(text.getvalue().split())
     assert "7 lost" in shown
     assert "reliable readers do not keep up with /drone/imu" in shown
 
 
 def test_pictures_that_come_late_are_said_to(monkeypatch: pytest.MonkeyPatch):
     """A camera that takes 30 ms for each look is late by about that; the IMU beside it is not."""
-    render = streaming.render_batch
-
-    def slow(*arguments: Any) -> Any:
-        packets = render(*arguments)
-        threading.Event().wait(0.03)
-        return packets
-
-    monkeypatch.setattr(streaming, "render_batch", slow)
+    before_looks(monkeypatch, lambda *_: time.sleep(0.03))
     with LiveRig(make_config()) as rig:
         pictures = rig.listen("/drone/rgb", Image)
         rig.send(rig.hover())

@@ -109,18 +109,16 @@ def test_the_viewer_suits_the_display(monkeypatch, viewer, display, platform, wa
     assert up_module.viewer_options(viewer) == wanted
 
 
-def test_a_file_that_is_there_is_refused_before_anything_runs(monkeypatch, tmp_path):
-    monkeypatch.setattr(up_module, "run_together", None)
+def test_a_file_that_is_there_is_refused_before_anything_runs(up, tmp_path):
     file = tmp_path / "live.rrd"
     file.write_bytes(b"mine")
     with pytest.raises(FileExistsError, match=r"live.rrd is there already: name another file"):
-        up_module.up(SimulationConfig(), viewer=str(file), record=None, overwrite=False)
+        up(SimulationConfig(), viewer=str(file))
     with pytest.raises(OSError, match="there is no folder"):
-        up_module.up(SimulationConfig(), viewer=str(tmp_path / "no" / "f.rrd"), record=None, overwrite=False)
+        up(SimulationConfig(), viewer=str(tmp_path / "no" / "f.rrd"))
 
 
 @pytest.mark.parametrize("viewer", ["rerun", "", "live.mp4", "Native"])
-def test_an_unknown_viewer_is_refused_before_anything_runs(monkeypatch, viewer):
-    monkeypatch.setattr(up_module, "run_together", None)
+def test_an_unknown_viewer_is_refused_before_anything_runs(up, viewer):
     with pytest.raises(ValueError, match=rf"native, web, none or a file that ends in .rrd, got '{viewer}'"):
-        up_module.up(SimulationConfig(), viewer=viewer, record=None, overwrite=False)
+        up(SimulationConfig(), viewer=viewer)

@@ -8,16 +8,19 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+import pytest
 from processes import SOON_S, wait_for
 
 from cortex import Node, Publisher, Subscriber, reliable
 from cortex.messages import Odometry, Parameters, SimulatorReply, SimulatorStatus
 from neurosim_core.config import SimulationConfig, load_config
+from neurosim_core.live import streaming
 from neurosim_core.live.config import LiveConfig
 from neurosim_core.live.messages import command_of
 from neurosim_core.live.simulator import Simulator
 from neurosim_core.live.topics import COMMANDS, SERVICES, command_topic
-from neurosim_core.sim import Model, make_fleet
+from neurosim_core.packets import Packet
+from neurosim_core.sim import Batch, Model, State, make_fleet
 from neurosim_core.vehicle.multirotor import MultirotorVehicleConfig
 
 IMU = {"kind": "imu", "rate_hz": 400.0, "accelerometer_noise_density": 0.01}
@@ -182,3 +185,14 @@ def drain(subscriber: Subscriber[Any], timeout_s: float = 0.2, *, least: int = 0
             messages.append(subscriber.recv(SOON_S if len(messages) < least else timeout_s))
         except TimeoutError:
             return messages
+
+
+def before_looks(monkeypatch: pytest.MonkeyPatch, action: Callable[[State, Batch], object]) -> None:
+    """Have something done each time before cameras look at a batch: it takes time, waits or fails."""
+    render = streaming.render_batch
+
+    def act_and_render(model: Model, state: State, batch: Batch) -> list[Packet]:
+        action(state, batch)
+        return render(model, state, batch)
+
+    monkeypatch.setattr(streaming, "render_batch", act_and_render)

@@ -113,7 +113,7 @@ def test_labels_and_flow_are_drawn_over_the_colour_camera_with_the_same_view():
         rig = {kind: find("sensor", kind)() for kind in (*kinds, colored)}
         rig["elsewhere"] = find("sensor", "instance")(lens=lens)
         over = overlays(describe_sensors(rig))
-        assert over == dict.fromkeys(("instance", "semantic", "optical_flow"), colored)
+        assert over == dict.fromkeys(("instance", "semantic", "optical_flow", "edges"), colored)
     assert not overlays(describe_sensors({"ids": rig["instance"]}))
 
 
