@@ -127,13 +127,15 @@ def _bench(questions: Sequence[Question], arguments: argparse.Namespace) -> int:
                 write_report(chapters, arguments.out, console)
                 shutil.rmtree(_stages(question, arguments), ignore_errors=True)
         except KeyboardInterrupt:
+            console.print("interrupted; the same command with --resume goes on", style="yellow")
             status = 130
     if arguments.json:
         sys.stdout.write("[" + ",\n".join(map(chapter_to_json, chapters)) + "]\n")
     verdicts = [claim.met for chapter in chapters for claim in chapter.claims]
     missed, met, unknown = (verdicts.count(verdict) for verdict in (False, True, None))
-    said = f"claims: {missed} missed, {met} met, {unknown} not measured here"
-    console.print(said, style="bold red" if missed else None)
+    if verdicts:
+        said = f"claims: {missed} missed, {met} met, {unknown} not measured here"
+        console.print(said, style="bold red" if missed else None)
     return status or int(arguments.strict and missed > 0)
 
 

@@ -105,7 +105,10 @@ def write_report(chapters: Sequence[Chapter], out: str | Path, console: Console)
             pictures[plot.name] = base64.b64encode(file.read_bytes()).decode("ascii")
     page = folder / "report.html"
     page.write_text(html_page(chapters, pictures), encoding="utf-8")
-    console.print(f"left in {folder}: report.html, chapters, tables, plots", soft_wrap=True)
+    newest = chapters[-1]
+    left = ["report.html", f"{newest.name}.json", *(f"{table.name}.csv" for table in newest.tables)]
+    left += [f"{plot.name}.png" for plot in newest.plots]
+    console.print(f"left in {folder}: {', '.join(left)}", soft_wrap=True)
 
 
 def html_page(chapters: Sequence[Chapter], pictures: Mapping[str, str]) -> str:

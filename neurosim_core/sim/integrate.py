@@ -101,18 +101,14 @@ def _checked_command(model: Model, state: State, command: ArrayLike, mode: Comma
     return state.controllers[mode].checked(command)
 
 
-def plan_batch(
-    state: State, stretch: Stretch, *, closed_loop: bool, begin_ns: int | None = None, begins: Any = None
-) -> Batch:
+def plan_batch(state: State, stretch: Stretch, *, closed_loop: bool, begins: Any = None) -> Batch:
     """Return the batch that takes the vehicles through a stretch; nothing changes until it is launched.
 
-    It begins at the end of what was launched, unless `begin_ns` says where. With `closed_loop` the path
-    controller commands; otherwise the last command is held. Worlds whose mask `begins` is not 0 begin with
-    it, device array of int32, shape [N].
+    It begins at the end of what was launched. With `closed_loop` the path controller commands; otherwise the
+    last command is held. Worlds whose mask `begins` is not 0 begin with it, device array of int32, shape [N].
     """
     closed_loop = closed_loop and state.path_controller is not None
-    number, max_step_ns = state.launched_count, state.vehicle.max_step_ns
-    begin_ns = state.launched_ns if begin_ns is None else begin_ns
+    number, begin_ns, max_step_ns = state.launched_count, state.launched_ns, state.vehicle.max_step_ns
     slot_count = state.trace.arrays.states.shape[0] // state.pipeline.flown_ahead
     return Batch(
         stretch=stretch,

@@ -137,7 +137,7 @@ class Simulation:
         self._begin = {name: wp.clone(getattr(self._state.start, name)) for name in Start.vars}
         self._warned = False
         self._observations: dict[Stretch, Observation] = {}
-        self._now_ns: int | None = None
+        self._has_begun = False
         self.duration_ns = 0
 
     @property
@@ -303,14 +303,11 @@ class Simulation:
             wp.copy(getattr(state.start, name), rows)
         reset_vehicles(self._model, state, self._mask)
         wp.copy(state.worlds.active, self._mask)  # sensors of the others do not see this
-        now_ns = 0 if mask is None else self._require_reset()
-        launch(
-            self._model,
-            state,
-            plan_batch(state, first, closed_loop=False, begin_ns=now_ns, begins=self._mask),
-        )
+        if mask is None:
+            state.launched_ns = 0
+        launch(self._model, state, plan_batch(state, first, closed_loop=False, begins=self._mask))
         state.worlds.active.fill_(1)
-        self._now_ns = now_ns
+        self._has_begun = True
         self.duration_ns = 0
         return self._observe(first)
 
@@ -360,18 +357,16 @@ class Simulation:
             observation = self._advance(closed_loop=True)
         return observation
 
-    def _require_reset(self) -> int:
-        if self._now_ns is None:
+    def _require_reset(self) -> None:
+        if not self._has_begun:
             raise RuntimeError("reset() must be called before step()")
-        return self._now_ns
 
     def _advance(self, *, closed_loop: bool) -> Observation:
         """Fly one control period."""
-        now_ns, state = self._require_reset(), self._state
-        stretch = self._schedule.stretch(now_ns, self._schedule.period_end_ns(now_ns))
-        launch(self._model, state, plan_batch(state, stretch, closed_loop=closed_loop, begin_ns=now_ns))
+        state = self._state
+        stretch = self._schedule.stretch(state.launched_ns, self._schedule.period_end_ns(state.launched_ns))
+        launch(self._model, state, plan_batch(state, stretch, closed_loop=closed_loop))
         self.duration_ns = stretch.duration_ns
-        self._now_ns = now_ns + stretch.duration_ns
         if state.pipeline.graphs.dropped_count > 0 and not self._warned:
             self._warned = True
             _logger.warning(
@@ -391,14 +386,14 @@ class Simulation:
         return self._observations[stretch]
 
     def _check_partial(self) -> None:
-        if self._now_ns is None:
+        if not self._has_begun:
             raise ValueError("mask: the first reset is of all worlds")
-        common_ns = self.common_ns
-        if common_ns == 0 or self._now_ns % common_ns != 0:
+        common_ns, now_ns = self.common_ns, self._state.launched_ns
+        if common_ns == 0 or now_ns % common_ns != 0:
             when = f"every {common_ns} ns" if common_ns else "never"
             raise ValueError(
                 "mask: a world that begins now would not be in step with the clocks of the rig, which tick "
-                f"together {when}, and it is {self._now_ns} ns: give all sensors rates that are multiples of "
+                f"together {when}, and it is {now_ns} ns: give all sensors rates that are multiples of "
                 f"control.rate_hz = {self._model.config.control.rate_hz:g}, or reset some worlds only then"
             )
 

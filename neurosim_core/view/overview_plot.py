@@ -26,6 +26,10 @@ _INK = "#1d2530"
 _FAINT = "#6b7682"
 _XYZ = ("#e03131", "#2f9e44", "#1c7ed6", "#f08c00", "#845ef7", "#12b886")
 _STRIPS_MAX = 4
+_ROUNDING = 1e-9
+"""Numbers that are all smaller than this are drawn as 0: rates of a vehicle that stands, say."""
+_NARROW = 0.5
+"""A plan has less than this of its height as its width where its titles would run into each other."""
 _STYLE: dict[Any, Any] = {
     "axes.edgecolor": _FAINT,
     "axes.labelcolor": _INK,
@@ -205,8 +209,10 @@ def _draw_strips(figure: Any, place: Any, strips: list[tuple[str, Any, Any]], st
             axes.plot(time_s, column, color=color, linewidth=1.6 if count == 1 else 1.0)
         axes.margins(x=0.0, y=0.12)
         finite = values[np.isfinite(values)]
-        if finite.size and 0.0 <= finite.min() <= 0.5 * finite.max():  # else 0 would flatten the curve
-            axes.set_ylim(0.0, 1.12 * max(float(finite.max()), 1e-9))
+        if finite.size and max(abs(finite.min()), abs(finite.max())) < _ROUNDING:
+            axes.set_ylim((0.0, 1.0) if finite.min() >= 0.0 else (-1.0, 1.0))
+        elif finite.size and 0.0 <= finite.min() <= 0.5 * finite.max():  # else 0 would flatten the curve
+            axes.set_ylim(0.0, 1.12 * float(finite.max()))
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="#e3e7ea", linewidth=0.8)
         axes.ticklabel_format(axis="y", useOffset=False)  # it would be below the title
@@ -235,7 +241,12 @@ def _draw_plan(axes: Any, scene: Scene, track: Track, snapshot: Snapshot) -> Non
     axes.axis("off")
     axes.set_title("Path", loc="left", fontweight="bold")
     directions = "x up, y left" if turned else "x right, y up"
-    axes.set_title(f"plan cut at {height_m:.2f} m, {directions}", loc="right", color=_FAINT)
+    cut = f"plan cut at {height_m:.2f} m, {directions}"
+    if size.min() < _NARROW * size.max():  # both titles are wider than the plan
+        behind: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points"}
+        axes.annotate(cut, (0.0, 1.0), (40.0, 6.0), **behind, fontsize=11, color=_FAINT)
+    else:
+        axes.set_title(cut, loc="right", color=_FAINT)
     light = 1.0 - 0.7 * (1.0 - plan.colors)  # paler than the path
     below = PolyCollection(place(plan.triangles), facecolors=light, edgecolors=light, linewidths=0.4)
     axes.add_collection(below, autolim=False)
@@ -268,7 +279,7 @@ def _draw_path(axes: Any, track: Track, snapshot: Snapshot, place: Any, size_m: 
     casing = LineCollection(segments, colors="white", linewidths=6.0, capstyle="round", zorder=3)
     line = LineCollection(segments, cmap="plasma", linewidths=3.2, capstyle="round", zorder=5)
     line.set_array(0.5 * (speed[:-1] + speed[1:]))
-    line.set_clim(0.0, max(float(speed.max()), 1e-3))
+    line.set_clim(0.0, float(speed.max()) if speed.max() > 1e-3 else 1.0)
     axes.add_collection(casing)
     axes.add_collection(line)
     _add_bar(axes, line, "speed [m/s]", shrink=0.5, anchor=(1.0, 1.0))

@@ -75,9 +75,10 @@ def test_a_report_of_all_and_options_that_reach_it(asked, tmp_path, capsys):
     assert "claims: 0 missed, 2 met, 0 not measured here" in said
 
 
-def test_each_chapter_is_left_as_soon_as_it_is_done(asked, tmp_path):
+def test_each_chapter_is_left_as_soon_as_it_is_done(asked, tmp_path, capsys):
     asked("one", "stops", "two")
     assert cli.main(["bench", "all", "--out", str(tmp_path)]) == 130
+    assert "interrupted; the same command with --resume goes on" in capsys.readouterr().out
     assert {file.name for file in tmp_path.iterdir()} == {"one.json", "report.html"}
 
 
@@ -100,7 +101,7 @@ def test_resuming_keeps_what_is_there(asked, tmp_path, capsys):
         ([], ["1 m/s", "2 m/s", "1 m/s", "2 m/s"]),
     ],
 )
-def test_stages_that_an_interrupted_question_left(asked, tmp_path, monkeypatch, more, measured):
+def test_stages_that_an_interrupted_question_left(asked, tmp_path, monkeypatch, capsys, more, measured):
     """They are kept where a run with the same options is resumed."""
     begun = []
 
@@ -118,6 +119,7 @@ def test_stages_that_an_interrupted_question_left(asked, tmp_path, monkeypatch, 
     monkeypatch.setattr(Question, "measure", measure)
     assert cli.main(["bench", "one", "--out", str(tmp_path)]) == 130
     assert cli.main(["bench", "one", "--out", str(tmp_path), *more]) == 0
+    assert "claims" not in capsys.readouterr().out  # there are none
     assert begun == measured
     assert json.loads((tmp_path / "one.json").read_text())["summary"] == "1 2"
     assert {file.name for file in tmp_path.iterdir()} == {"one.json", "report.html"}

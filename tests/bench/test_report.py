@@ -63,7 +63,8 @@ def test_a_report_on_disk(tmp_path):
     assert rows[0]["error [m]"] == "1.23456789e-07"
     with Image.open(tmp_path / "r" / "landing-plot.png") as drawn:
         assert np.asarray(drawn.convert("L")).std() > 5.0
-    assert "left in" in said.getvalue()
+    told = "left in {}: report.html, landing.json, landing-table.csv, landing-plot.png"
+    assert told.format(tmp_path / "r") in said.getvalue()
 
 
 def test_a_chapter_survives_json(tmp_path):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
 import sys
+from typing import Any
 
 import numpy as np
 import PIL.Image
@@ -220,3 +223,45 @@ def test_missing_matplotlib_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ImportError, match=r"pip install -e '\.\[view\]'"):
         save_overview(tmp_path / "o.png", FlightSummary(), scene=make_scene(room()))
+
+
+def test_a_vehicle_that_stands_is_drawn_at_zero(tmp_path, monkeypatch):
+    """Rounding, as of an IMU that stands, is not spread over the whole strip."""
+    shown = texts_of(tmp_path, monkeypatch, room(), velocity=1e-13)
+    assert not [text for text in shown if re.search(r"\de.\d", text)]  # no 1e-13 above an axis
+    assert "1.0" in shown
+
+
+def test_titles_of_a_narrow_plan_stand_beside_each_other(tmp_path, monkeypatch):
+    hall = trimesh.creation.box(extents=(8, 3, 2.5))
+    boxes = texts_of(tmp_path, monkeypatch, hall, velocity=0.1)
+    name, cut = boxes["Path"], next(box for text, box in boxes.items() if text.startswith("plan cut"))
+    assert name.x1 < cut.x0
+    assert cut.x1 < 1600
+
+
+def texts_of(tmp_path, monkeypatch, mesh: trimesh.Trimesh, *, velocity: float) -> dict[str, Any]:
+    """Return the texts of the overview of a vehicle that hardly moves, and where they stand [px]."""
+    from matplotlib.figure import Figure
+    from matplotlib.text import Text
+
+    figures: list[Figure] = []
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda self, path: (figures.append(self), save(self, path)))
+    summary = FlightSummary()
+    for k in range(20):
+        stands = dataclasses.replace(
+            odometry(k), position=np.array([0.0, 0.0, 1.2]), velocity=np.array([velocity, 0.0, 0.0])
+        )
+        summary.log(stands)
+        summary.log(
+            ImuSample(
+                stamp_ns=k * 5 * MS,
+                sensor="imu",
+                specific_force=np.array([0, 0, 9.8]),
+                angular_rate=np.full(3, 1e-16 * (-1) ** k),
+            )
+        )
+    save_overview(tmp_path / "o.png", summary, scene=make_scene(mesh))
+    texts = [text for text in figures[0].findobj(Text) if text.get_text() and text.get_visible()]
+    return {text.get_text(): text.get_window_extent() for text in texts}
