@@ -91,6 +91,13 @@ def device(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
+@pytest.fixture
+def kernel_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache of kernels for the test alone, which is empty."""
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    return tmp_path
+
+
 @pytest.fixture(scope="session")
 def house() -> Path:
     """The textured house that is kept beside the project."""

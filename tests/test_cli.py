@@ -491,8 +491,10 @@ def test_options_are_not_abbreviated(capsys):
 def test_sensors_that_are_absent_are_said_first(tmp_path, monkeypatch, capsys):
     (tmp_path / "scene.yaml").write_text(yaml.safe_dump({**SETTINGS, "sensors": {"imu": {"kind": "imu"}}}))
     monkeypatch.chdir(tmp_path)
-    assert cli.main(["run", "scene.yaml", "--duration", "0.05", "--no-rrd"]) == 0
-    first = capsys.readouterr().out.partition(" flies ")[0]
+    status = cli.main(["run", "scene.yaml", "--duration", "0.05", "--no-rrd"])
+    said, errors = capsys.readouterr()
+    assert status == 0, errors
+    first = said.partition(" flies ")[0]
     assert "apartment with 1 room, seed" in first
     assert "Absent of the default sensors: events, rgb, depth, odometry." in first
     assert max(map(len, first.splitlines())) > 80  # lines are not broken for a pipe as for a narrow terminal

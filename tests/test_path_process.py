@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 import pytest
+from processes import children_of, gone
 from small_room import room_scene
 
 import neurosim_core as ns
@@ -28,11 +31,14 @@ def settings_in(folder: Path, **path: Any) -> dict[str, Any]:
 
 
 def model_by_processes(settings: dict[str, Any], *, kill: bool = False) -> Model:
-    with PlanningProcess() as planner, SceneReader(settings) as reader:
-        reader.planner = planner
-        if kill:
-            planner._process.kill()
-        return make_model(ns.load_config(settings), reader=reader)
+    before = children_of(os.getpid())
+    with PlanningProcess() as planner:
+        (pid,) = children_of(os.getpid()) - before
+        with SceneReader(settings) as reader:
+            reader.planner = planner
+            if kill:
+                os.kill(pid, signal.SIGKILL)
+            return make_model(ns.load_config(settings), reader=reader)
 
 
 def test_a_path_is_the_one_that_is_planned_here(tmp_path, monkeypatch):
@@ -72,7 +78,10 @@ def test_why_there_is_no_path_is_said_here(tmp_path):
 
 def test_other_paths_are_planned_here(tmp_path):
     settings = settings_in(tmp_path) | {"path": {"kind": "hover", "position_m": [0.5, 0.5, 1.0]}}
-    with PlanningProcess() as planner, SceneReader(settings, planner=planner) as reader:
-        path = make_model(ns.load_config(settings), reader=reader).path
-        assert planner._process.poll() is not None  # it does not stay as long as the flight
+    before = children_of(os.getpid())
+    with PlanningProcess() as planner:
+        (pid,) = children_of(os.getpid()) - before
+        with SceneReader(settings, planner=planner) as reader:
+            path = make_model(ns.load_config(settings), reader=reader).path
+            assert gone(pid)  # it does not stay as long as the flight
     np.testing.assert_array_equal(path.evaluate([0]).position, [[0.5, 0.5, 1.0]])

@@ -18,9 +18,8 @@ from neurosim_core import warp_start
 from neurosim_core.warp_start import has_kernels, start_warp
 
 
-def test_an_empty_kernel_cache_is_known(tmp_path, monkeypatch):
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    (tmp_path / "wp_somebody.else_0123").mkdir()
+def test_an_empty_kernel_cache_is_known(kernel_cache):
+    (kernel_cache / "wp_somebody.else_0123").mkdir()
     assert not has_kernels()
 
     @wp.kernel(module=wp.get_module("neurosim_core.first"), enable_backward=False)
@@ -77,7 +76,7 @@ def test_that_no_device_is_to_be_seen_is_not_told():
     assert run.stderr == "something else\n"
 
 
-def test_threads_compile_with_the_same_precompiled_headers(tmp_path, monkeypatch):
+def test_threads_compile_with_the_same_precompiled_headers(kernel_cache):
     """The second thread reads the file of the first: Warp on its own would write one for each."""
     start_warp()
 
@@ -94,7 +93,6 @@ def test_threads_compile_with_the_same_precompiled_headers(tmp_path, monkeypatch
         files = Path(wp.config.kernel_cache_dir, "headers").rglob("*.pch")
         return {(str(file), file.stat().st_mtime_ns) for file in files}
 
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     compile_adder(3)
     first = headers()
     thread = threading.Thread(target=compile_adder, args=(5,))
@@ -104,9 +102,8 @@ def test_threads_compile_with_the_same_precompiled_headers(tmp_path, monkeypatch
     assert headers() == first
 
 
-def test_who_needs_the_same_kernels_waits_for_who_compiles_them(tmp_path, monkeypatch):
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    folder = tmp_path / "wp_module_0123"
+def test_who_needs_the_same_kernels_waits_for_who_compiles_them(kernel_cache):
+    folder = kernel_cache / "wp_module_0123"
 
     def compile_module(module, device, folder):
         if folder.exists():
@@ -119,20 +116,20 @@ def test_who_needs_the_same_kernels_waits_for_who_compiles_them(tmp_path, monkey
     with ThreadPoolExecutor(4) as pool:
         compiled = list(pool.map(lambda _: compile_or_wait(None, "cpu", folder), range(4)))
     assert sorted(compiled) == [False, False, False, True]
-    shutil.rmtree(tmp_path / "locks")
+    shutil.rmtree(kernel_cache / "locks")
     assert not compile_or_wait(None, "cpu", folder)
-    assert not (tmp_path / "locks").exists()  # what is compiled may lie in a cache that is not to be written
+    # what is compiled may lie in a cache that is not to be written
+    assert not (kernel_cache / "locks").exists()
 
 
-def test_a_process_that_stands_still_holds_up_nobody_for_ever(tmp_path, monkeypatch):
+def test_a_process_that_stands_still_holds_up_nobody_for_ever(kernel_cache, monkeypatch):
     """It has the lock of what it compiles."""
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
     monkeypatch.setattr(warp_start, "_COMPILE_S", 0.05)
-    (tmp_path / "locks").mkdir()
+    (kernel_cache / "locks").mkdir()
     compile_or_wait = warp_start._compile_once(lambda module, device, folder: True)
-    with open(tmp_path / "locks" / "wp_module_0123", "a") as held:
+    with open(kernel_cache / "locks" / "wp_module_0123", "a") as held:
         fcntl.flock(held, fcntl.LOCK_EX)
-        assert compile_or_wait(None, "cpu", tmp_path / "wp_module_0123")
+        assert compile_or_wait(None, "cpu", kernel_cache / "wp_module_0123")
 
 
 def test_windows_has_no_locks_of_files_and_computes_without_them(tmp_path):

@@ -18,7 +18,7 @@ from neurosim_core.runtime.cuda import Launches
 from neurosim_core.runtime.pinned import PinnedMapping
 from neurosim_core.runtime.timing import timed
 from neurosim_core.scene.bodies import pose_bodies
-from neurosim_core.sensors.base import FrameSensor, PictureViews
+from neurosim_core.sensors.base import PictureViews
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.render_group import BatchBuffers, RenderGroupState
 from neurosim_core.sim.state import Batch, State
@@ -264,17 +264,21 @@ def plan_scans(state: State, batch: Batch) -> list[Launches]:
             frames = buffers.renderer.log_radiance
             if stamps_ns and (batch.begins is not None or name not in group.watching):
                 mask = state.worlds.active if batch.begins is None else batch.begins
-                scans.append(Launches(None, partial(_begin, sensor, frames, stamps_ns, batch.until_ns, mask)))
-                group.watching.add(name)
+                begin = partial(_begin, group, name, frames, stamps_ns, batch.until_ns, mask)
+                scans.append(Launches(None, begin))
             elif (scan := sensor.plan(frames, stamps_ns, batch.until_ns)) is not None:
                 key = None if scan.key is None else (name, scan.key)  # sensors of a kind have equal keys
                 scans.append(scan._replace(key=key))
     return scans
 
 
-def _begin(sensor: FrameSensor, frames: Any, stamps_ns: Sequence[int], end_ns: int, mask: Any) -> None:
+def _begin(
+    group: RenderGroupState, name: str, frames: Any, stamps_ns: Sequence[int], end_ns: int, mask: Any
+) -> None:
     """Let a sensor take the first frame as its reference and, in one world, see those that follow."""
+    sensor = group.frames[name]
     sensor.begin(frames, stamps_ns[0], mask)
+    group.watching.add(name)
     scan = sensor.plan(frames[1:], stamps_ns[1:], end_ns) if len(stamps_ns) > 1 else None
     if scan is not None:
         scan.launch()

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import SOON_S, wait_for
+from processes import SOON_S, children_of, gone, wait_for
 
 from cortex.bench.cases import CASES, Bar, Case, Contestant, choose
 from cortex.bench.command import main
@@ -82,25 +82,6 @@ def _hangs(pipe: Any, _job: None) -> None:
     helper = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     pipe.send([os.getpid(), helper.pid])
     helper.wait()
-
-
-def stat_of(pid: int) -> list[str]:
-    """State and parent of a process, among others; those of a zombie if there is none."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except (FileNotFoundError, ProcessLookupError):
-        return ["Z", "0"]
-
-
-def gone(pid: int) -> bool:
-    """Return whether a process has ended (a zombie has)."""
-    return stat_of(pid)[0] == "Z"
-
-
-def children_of(parent: int) -> list[int]:
-    return [
-        pid for pid in map(int, filter(str.isdigit, os.listdir("/proc"))) if stat_of(pid)[1] == str(parent)
-    ]
 
 
 @pytest.mark.parametrize(

@@ -285,7 +285,7 @@ def test_any_failure_ends_the_recording_with_an_error(node, tmp_path, where, cap
         values = numbers(log)
         assert log.cut == ("" if where == "_flush_old" else "it was not closed")
     assert values == list(range(recorder.stats.written))
-    assert recorder.stats.unwritten == recorder._received - len(values)
+    assert recorder.stats.unwritten == publisher.counters.published - len(values)
 
 
 @pytest.fixture(scope="module")

@@ -181,7 +181,7 @@ def test_closing_while_another_thread_is_held_up(node):
 
     threads = [Beside(ends), Beside(ends)]
     published = -1
-    while published != (published := publisher._fast_send.sequence) or published < 100:
+    while published != (published := publisher.counters.published) or published < 100:
         time.sleep(0.05)
     publisher.close()
     assert [thread.join() for thread in threads] == [[True], [True]]

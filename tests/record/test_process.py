@@ -19,6 +19,7 @@ import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from processes import children_of, gone, wait_for
 from test_hdf5 import HEADER, MS, assert_same, image, make_events, make_flight, write
 
 from neurosim_core.packets import Events, FieldSpec, Packet
@@ -30,7 +31,7 @@ PACKETS = make_flight(5, [700, 0, 20_000, 30, 1, 500] * 4)[:-1]
 BEGIN = """
 import contextlib, os, signal, sys, time
 from pathlib import Path
-sys.path.insert(0, sys.argv[2])
+sys.path[:0] = [sys.argv[2], os.path.join(sys.argv[2], "..", "support")]
 from test_hdf5 import HEADER, image
 from test_process import PACKETS
 from neurosim_core.record.process import RecordingProcess, start_process
@@ -199,11 +200,34 @@ writer.close()
         assert [packet.stamp_ns for packet in flight.packets()] == [*range(int(kept_ns) + 1)]
 
 
-def test_a_writer_that_is_killed_is_noticed(tmp_path):
+@pytest.fixture
+def none_waits(tmp_path_factory):
+    """No process waits for a recording: one that a test before has left takes this one."""
+    RecordingProcess(tmp_path_factory.mktemp("left") / "f.h5", HEADER).close()
+
+
+@pytest.mark.usefixtures("none_waits")
+def test_a_process_that_is_killed_while_it_waits_is_replaced(tmp_path):
+    before = children_of(os.getpid())
+    start_process()
+    (pid,) = children_of(os.getpid()) - before
+    os.kill(pid, signal.SIGKILL)
+    wait_for(lambda: gone(pid))
     writer = RecordingProcess(tmp_path / "f.h5", HEADER)
     writer.write(PACKETS[0])
-    writer._process.popen.kill()
-    writer._process.popen.wait()
+    writer.close()
+    with Recording(tmp_path / "f.h5") as flight:
+        assert flight.clean
+        assert len([*flight.packets()]) == 1
+
+
+@pytest.mark.usefixtures("none_waits")
+def test_a_writer_that_is_killed_is_noticed(tmp_path):
+    before = children_of(os.getpid())
+    writer = RecordingProcess(tmp_path / "f.h5", HEADER)
+    writer.write(PACKETS[0])
+    (pid,) = children_of(os.getpid()) - before
+    os.kill(pid, signal.SIGKILL)
     with pytest.raises(OSError, match="the process that writes it ended by signal 9"):
         all(writer.write(packet) is None for packet in itertools.repeat(PACKETS[0]))
     assert writer.kept_ns is None
@@ -211,15 +235,15 @@ def test_a_writer_that_is_killed_is_noticed(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="which processes there are, only Linux says in files")
+@pytest.mark.usefixtures("none_waits")
 def test_a_compressor_that_is_killed_is_noticed(tmp_path):
+    before = children_of(os.getpid())
     writer = RecordingProcess(tmp_path / "f.h5", HEADER)
     writer.write(PACKETS[0])
-    pid = writer._process.popen.pid
-    children: list[str] = []
-    while len(children) < deflate_count():
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    for child in children:
-        os.kill(int(child), signal.SIGKILL)
+    (pid,) = children_of(os.getpid()) - before
+    wait_for(lambda: len(children_of(pid)) >= deflate_count())
+    for child in children_of(pid):
+        os.kill(child, signal.SIGKILL)
     for packet in PACKETS[1:]:
         writer.write(packet)
     with pytest.raises(OSError, match="a process that compresses has ended"):
@@ -228,19 +252,22 @@ def test_a_compressor_that_is_killed_is_noticed(tmp_path):
         assert not flight.clean
 
 
+@pytest.mark.usefixtures("none_waits")
 def test_writing_waits_for_a_process_that_stands_still(tmp_path):
     """Without end neither memory grows nor anything is lost."""
-    data = np.zeros((1000, 1000), np.float32)
     packets = [image(stamp_ns=k, shape=(1000, 1000, 4)) for k in range(30)]  # 4 MB each
+    before = children_of(os.getpid())
     writer = RecordingProcess(tmp_path / "f.h5", HEADER)
     writer.write(packets[0])
-    os.kill(writer._process.popen.pid, signal.SIGSTOP)
-    rest = threading.Thread(target=lambda: [*map(writer.write, packets[1:])], daemon=True)
+    (pid,) = children_of(os.getpid()) - before
+    os.kill(pid, signal.SIGSTOP)
+    written: list[None] = []
+    rest = threading.Thread(target=lambda: written.extend(map(writer.write, packets[1:])), daemon=True)
     rest.start()
     rest.join(1.0)
     assert rest.is_alive()
-    assert data.nbytes < writer._put_bytes < 20 * data.nbytes
-    os.kill(writer._process.popen.pid, signal.SIGCONT)
+    assert 0 < len(written) < 20
+    os.kill(pid, signal.SIGCONT)
     rest.join(60.0)
     writer.close()
     with Recording(tmp_path / "f.h5") as flight:
@@ -258,7 +285,7 @@ def test_a_disk_that_hangs_is_said_and_ctrl_c_ends_the_waiting(tmp_path, monkeyp
     code = """
 while not os.path.getsize(sys.argv[1]):
     time.sleep(0.01)
-print(writer._process.popen.pid, flush=True)
+print("begun", flush=True)
 open(os.environ["HANGS"], "w").close()
 for packet in PACKETS:
     writer.write(packet)
@@ -271,7 +298,8 @@ except KeyboardInterrupt:
     with run(code, tmp_path / "f.h5") as process:
         assert process.stdout is not None
         assert process.stderr is not None
-        writer = int(process.stdout.readline())
+        assert process.stdout.readline() == "begun\n"
+        (writer,) = children_of(process.pid)
         try:
             said = process.stderr.readline()
             assert re.search(r"f.h5: the disk took nothing for 5 s; \d+\.\d MB wait for it", said)
@@ -321,7 +349,8 @@ for k, packet in enumerate(PACKETS):
     writer.write(packet)
     if k == 50:
         os.killpg(0, number)
-        os.killpg(writer._process.popen.pid, number)
+        (child,) = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+        os.killpg(int(child), number)
 writer.close()
 print(stopped)
 """

@@ -7,7 +7,6 @@ import os
 
 import numpy as np
 import pytest
-import warp as wp
 from render_scenes import plane, point_light, scene_of
 
 from neurosim_core.render import light_cache
@@ -17,10 +16,9 @@ from neurosim_core.render.refine import refine
 
 
 @pytest.fixture
-def entries(tmp_path, monkeypatch):
+def entries(kernel_cache):
     """The files that are kept, in a folder of their own."""
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    return lambda: sorted((tmp_path / "light").glob("*"))
+    return lambda: sorted((kernel_cache / "light").glob("*"))
 
 
 SCENE = scene_of(plane(4.0), lights=(point_light((0.0, 0.0, 2.0), 3.0),))
@@ -48,7 +46,7 @@ def test_light_is_read_for_the_same_scene_and_settings_alone(entries):
     assert len(entries()) == 3  # a small scene is lit as fast as its light is read
 
 
-def test_what_is_damaged_or_cannot_be_written_is_computed(entries, tmp_path):
+def test_what_is_damaged_or_cannot_be_written_is_computed(entries):
     first = bake()
     (entry,) = entries()
     for damaged in (b"", entry.read_bytes()[:-8], b"PK nonsense"):

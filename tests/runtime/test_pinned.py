@@ -19,8 +19,8 @@ from neurosim_core.runtime.pinned import PinError, PinnedMapping
 class Driver:
     """Takes the place of CUDA's driver; memory is known by where it is."""
 
-    def __init__(self, code: int = 0) -> None:
-        self.code = code
+    def __init__(self) -> None:
+        self.code = 0
         self.pinned: dict[int, int] = {}
 
     def cuMemHostRegister_v2(self, address: ctypes.c_void_p, size: ctypes.c_size_t, flags: int) -> int:
@@ -37,6 +37,13 @@ class Driver:
 
 
 @pytest.fixture
+def driver(monkeypatch: pytest.MonkeyPatch) -> Driver:
+    made = Driver()
+    monkeypatch.setattr(pinned, "_driver", lambda: made)
+    return made
+
+
+@pytest.fixture
 def memory() -> mmap.mmap:
     return mmap.mmap(-1, 5 * mmap.PAGESIZE)
 
@@ -45,9 +52,7 @@ def address_of(memory: mmap.mmap) -> int:
     return int(np.frombuffer(memory, np.uint8).ctypes.data)
 
 
-def test_all_of_it_is_pinned_until_it_is_closed(memory, monkeypatch):
-    driver = Driver()
-    monkeypatch.setattr(pinned, "_driver", lambda: driver)
+def test_all_of_it_is_pinned_until_it_is_closed(memory, driver):
     made = PinnedMapping.made_count
     mapping = PinnedMapping(memory, "cpu")
     assert PinnedMapping.made_count == made + 1
@@ -61,8 +66,8 @@ def test_all_of_it_is_pinned_until_it_is_closed(memory, monkeypatch):
     memory.close()
 
 
-def test_an_error_leaves_nothing_behind(memory, monkeypatch):
-    monkeypatch.setattr(pinned, "_driver", lambda: Driver(code=801))
+def test_an_error_leaves_nothing_behind(memory, driver):
+    driver.code = 801
     with pytest.raises(PinError, match="801"):
         PinnedMapping(memory, "cpu")
     memory.close()
@@ -119,11 +124,9 @@ def test_a_device_copies_into_it(memory):
     mapping.close()
 
 
-def test_memory_is_let_go_whatever_the_device_says(memory, monkeypatch, caplog):
+def test_memory_is_let_go_whatever_the_device_says(memory, driver, monkeypatch, caplog):
     """A device that has failed says so again when it is waited for, and when memory is to be unpinned."""
-    driver = Driver()
-    monkeypatch.setattr(pinned, "_driver", lambda: driver)
-    monkeypatch.setattr(driver, "cuMemHostUnregister", lambda address: driver.pinned.clear() or 700)
+    driver.cuMemHostUnregister = lambda address: driver.pinned.clear() or 700
     mapping = PinnedMapping(memory, "cpu")
     mapping.close()
     assert "700" in caplog.text

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import errno
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -16,6 +17,7 @@ import numpy as np
 import PIL.Image
 import pytest
 import trimesh
+from processes import children_of
 from small_room import room_scene
 
 import neurosim_core as ns
@@ -143,7 +145,7 @@ def test_its_process_ends_with_the_one_that_asks():
 import os, signal
 from neurosim_core.scene.reader import SceneReader
 reader = SceneReader({"scene": "apartment"})
-print(reader._process.pid, flush=True)
+print(open(f"/proc/self/task/{os.getpid()}/children").read(), flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
@@ -188,16 +190,19 @@ def test_a_disk_without_room_is_done_without(tmp_path, monkeypatch):
 
 def test_a_process_that_ends_too_early_is_done_without(tmp_path):
     config = MeshSceneConfig.model_validate(room_scene(tmp_path))
+    before = children_of(os.getpid())
     with SceneReader({"scene": config.model_dump(mode="json")}) as reader:
+        (pid,) = children_of(os.getpid()) - before
         reader.geometry(config)
-        reader._process.kill()
+        os.kill(pid, signal.SIGKILL)
         assert make_model(settings_in(config), reader=reader).scene.name == "room"
 
 
 def test_a_scene_that_nobody_waits_for_is_given_up():
-    with SceneReader({"scene": "apartment"}) as reader:
-        process = reader._process
-    assert process.returncode is not None
+    before = children_of(os.getpid())
+    with SceneReader({"scene": "apartment"}):
+        (pid,) = children_of(os.getpid()) - before
+    assert pid not in children_of(os.getpid())
 
 
 def test_the_kind_of_a_scene_without_one_is_that_of_its_keys(tmp_path):

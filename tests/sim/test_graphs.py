@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
+from world_rig import LENS, RIG, UNSHADOWED, room
 
 import neurosim_core as ns
 from neurosim_core import sim
 from neurosim_core.runtime import cuda
 from neurosim_core.sensors.base import FrameContext, FrameSensor, FrameSensorConfig, RenderRequest
-from tests.sim.world_rig import LENS, RIG, UNSHADOWED, room
 
 
 @pytest.fixture

@@ -293,6 +293,25 @@ def processes_with(text: str) -> list[int]:
     return found
 
 
+def stat_of(pid: int) -> list[str]:
+    """State and parent of a process, among others; those of a zombie if there is none."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        return ["Z", "0"]
+
+
+def gone(pid: int) -> bool:
+    """Return whether a process has ended (a zombie has)."""
+    return stat_of(pid)[0] == "Z"
+
+
+def children_of(parent: int) -> set[int]:
+    """Processes that a process has started."""
+    pids = map(int, filter(str.isdigit, os.listdir("/proc")))
+    return {pid for pid in pids if stat_of(pid)[1] == str(parent)}
+
+
 def shared_mappings() -> list[str]:
     """Rings that this process has mapped or open."""
     maps = [line for line in Path("/proc/self/maps").read_text().splitlines() if "memfd:cortex" in line]

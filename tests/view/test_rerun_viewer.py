@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import rerun as rr
-from processes import SOON_S, wait_for
+from processes import SOON_S, children_of, gone, wait_for
 
 from neurosim_core.view import rerun_viewer
 from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded
@@ -38,13 +38,15 @@ def listening(pid: int) -> set[tuple[str, int]]:
 
 
 def test_it_listens_on_this_machine_only():
+    before = children_of(os.getpid())
     with RerunViewer(web=True) as viewer:
+        (pid,) = children_of(os.getpid()) - before
         recording = viewer.open("flight 1").recording
         recording.log("text", rr.TextDocument("hello"))
         recording.flush(timeout_sec=SOON_S)
         ports = {int(port) for port in re.findall(r"127\.0\.0\.1:(\d+)", viewer.page_url)}
         assert len(ports) == 2
-        assert listening(viewer._process.pid) == {("127.0.0.1", port) for port in ports}
+        assert listening(pid) == {("127.0.0.1", port) for port in ports}
         assert viewer.page_url.endswith(f"/?url=rerun%2B{viewer.data_url.removeprefix('rerun+')}")
         with urllib.request.urlopen(viewer.page_url, timeout=SOON_S) as page:
             assert b"wasm" in page.read()
@@ -74,17 +76,18 @@ def test_it_ends_with_a_parent_that_is_killed():
     code = (
         "from neurosim_core.view.rerun_viewer import RerunViewer\n"
         "viewer = RerunViewer(web=True)\n"
-        "print(viewer._process.pid, flush=True)\n"
+        "print('begun', flush=True)\n"
         "input()\n"
     )
     with subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as parent:
         assert parent.stdout is not None
-        pid = int(parent.stdout.readline())
+        assert parent.stdout.readline() == "begun\n"
+        (pid,) = children_of(parent.pid)
         assert listening(pid)
         parent.kill()
-    wait_for(lambda: not Path(f"/proc/{pid}").exists() or " Z " in Path(f"/proc/{pid}/stat").read_text())
+    wait_for(lambda: gone(pid))
 
 
 def test_a_viewer_that_fails_says_why(monkeypatch, tmp_path):
@@ -104,12 +107,13 @@ def test_a_viewer_that_fails_says_why(monkeypatch, tmp_path):
         "server = socket.create_server(('127.0.0.1', port))\n"
         "while True: server.accept()\n"
     )
+    before = children_of(os.getpid())
     with RerunViewer(web=False) as window:
-        window._process.send_signal(signal.SIGUSR1)
+        os.kill(*(children_of(os.getpid()) - before), signal.SIGUSR1)
         wait_for(lambda: window.ended)
         window.check()
     with RerunViewer(web=False) as window:
-        window._process.send_signal(signal.SIGUSR2)
+        os.kill(*(children_of(os.getpid()) - before), signal.SIGUSR2)
         wait_for(lambda: window.ended)
         with pytest.raises(ViewerEnded, match=r"(?s)status 1:.*graphics are broken"):
             window.check()
