@@ -54,12 +54,12 @@ def _run_command(argv: Sequence[str] | None) -> int:
     if not arguments.many_blas_threads:  # matrices are small, and threads cost time; learning has large ones
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments.began_s = began_s
-    if arguments.computes:
-        from neurosim_core.warp_start import start_warp
-
-        start_warp()
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
     try:
+        if arguments.computes:
+            from neurosim_core.warp_start import start_warp
+
+            start_warp()
         return int(arguments.command(arguments))
     except (ValueError, OSError, ImportError, RuntimeError, ArithmeticError) as error:
         if arguments.debug:

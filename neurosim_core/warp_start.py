@@ -31,7 +31,11 @@ def start_warp() -> None:
     The line about a CUDA driver or device that is missing, or hidden by CUDA_VISIBLE_DEVICES, is written by
     native code straight to the standard error stream: the stream is held back while Warp starts, and what
     else was written to it is written again.
+
+    Raises:
+        OSError: The folder for compiled kernels cannot be made.
     """
+    global _owner
     started = _owner is not None
     refuse_forked_process()
     if started:
@@ -43,6 +47,12 @@ def start_warp() -> None:
         os.dup2(held.fileno(), 2)
         try:
             wp.init()
+        except OSError as error:
+            _owner = None  # it has not started
+            raise type(error)(
+                f"cannot make {wp.config.kernel_cache_dir}, where compiled kernels are kept: "
+                f"{error.strerror}; set WARP_CACHE_PATH to a folder that can be written"
+            ) from error
         finally:
             os.dup2(stderr, 2)
             os.close(stderr)

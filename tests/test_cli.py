@@ -16,6 +16,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 from PIL import Image
 
@@ -202,6 +203,20 @@ def test_a_full_disk_is_told_with_the_name_of_what_is_saved(flown, tmp_path, cap
     assert status == 1
     assert f"cannot write {tmp_path / name}: File too large" in capsys.readouterr().err
     assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize(
+    "command", ["scene {room} --out {out}", "compare {flight} --out {out}", "dataset --flights 1 --out {out}"]
+)
+def test_what_cannot_be_written_is_named(flown, tmp_path, capsys, command):
+    """As a path that goes through a file."""
+    (tmp_path / "file").touch()
+    out = tmp_path / "file" / "out.png"
+    room = tmp_path / "room.glb"
+    trimesh.creation.box(extents=(4, 4, 3)).export(room)
+    arguments = command.format(room=room, flight=flown[0] / "flight.h5", out=out).split()
+    assert cli.main(arguments) == 1
+    assert f"neurosim: cannot write {out}: " in capsys.readouterr().err
 
 
 def test_a_full_disk_keeps_what_was_flown(tmp_path):
@@ -476,8 +491,10 @@ def test_options_are_not_abbreviated(capsys):
 def test_sensors_that_are_absent_are_said_first(tmp_path, monkeypatch, capsys):
     (tmp_path / "scene.yaml").write_text(yaml.safe_dump({**SETTINGS, "sensors": {"imu": {"kind": "imu"}}}))
     monkeypatch.chdir(tmp_path)
-    assert cli.main(["run", "scene.yaml", "--duration", "0.05", "--no-rrd"]) == 0
-    first = capsys.readouterr().out.partition(" flies ")[0]
+    status = cli.main(["run", "scene.yaml", "--duration", "0.05", "--no-rrd"])
+    said, errors = capsys.readouterr()
+    assert status == 0, errors
+    first = said.partition(" flies ")[0]
     assert "apartment with 1 room, seed" in first
     assert "Absent of the default sensors: events, rgb, depth, odometry." in first
     assert max(map(len, first.splitlines())) > 80  # lines are not broken for a pipe as for a narrow terminal

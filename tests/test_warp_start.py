@@ -44,6 +44,21 @@ def test_the_kernel_cache_is_found_before_anything_was_computed(tmp_path):
     assert run.stdout == "True\n"
 
 
+def test_a_kernel_cache_that_cannot_be_made_is_told_in_a_line(tmp_path):
+    (tmp_path / "file").touch()
+    run = subprocess.run(
+        [sys.executable, "-m", "neurosim_core", "convert", "in.csv", "out.raw"],
+        env=os.environ | {"WARP_CACHE_PATH": str(tmp_path / "file" / "cache")},
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 1
+    cache = tmp_path / "file" / "cache" / wp.config.version
+    assert run.stderr.startswith(f"neurosim: cannot make {cache}, where compiled kernels are kept: Not a")
+    assert run.stderr.endswith("set WARP_CACHE_PATH to a folder that can be written\n")
+
+
 def test_that_no_device_is_to_be_seen_is_not_told():
     """As with a driver and CUDA_VISIBLE_DEVICES="": what else is written while Warp starts is kept."""
     lines = [

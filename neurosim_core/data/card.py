@@ -12,7 +12,7 @@ from PIL import Image as Picture
 from PIL import ImageDraw
 
 from neurosim_core import __version__
-from neurosim_core.data.make import DEPTH_EDGES_M, SPEED_EDGES_M_S, DatasetPlan, FlightStats
+from neurosim_core.data.make import DEPTH_EDGES_M, SPEED_EDGES_M_S, DatasetPlan, FlightStats, write_whole
 from neurosim_core.data.stream import Dataset
 from neurosim_core.view.pictures import BACKGROUND_SRGB, color_picture, event_picture
 
@@ -30,9 +30,9 @@ def write_card(plan: DatasetPlan, *, command: str) -> None:
     if picture is not None:
         buffer = io.BytesIO()
         picture.save(buffer, "PNG")
-        (plan.folder / "sheet.png").write_bytes(buffer.getvalue())
+        write_whole(plan.folder / "sheet.png", buffer.getvalue())
     text = _write_text(plan, stats, command=command, has_sheet=picture is not None)
-    (plan.folder / "README.md").write_text(text, "utf-8")
+    write_whole(plan.folder / "README.md", text.encode())
 
 
 def _read_stats(path: Path) -> FlightStats:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from neurosim_core.install import need
 from neurosim_core.io import open_events
 from neurosim_core.packets import EventArrays
+from neurosim_core.record.disk import naming_file
 
 RATE_BIN_US = 10_000
 """Time between two points of the event rate [us]."""
@@ -219,7 +220,8 @@ def draw_comparison(stats: Sequence[EventStats], out: Path) -> None:
     width = 6 // max(1, min(len(shown), 6))
     for column, one in enumerate(shown):
         _draw_map(figure.add_subplot(grid[2, column * width : (column + 1) * width]), one)
-    figure.savefig(out)
+    with naming_file(out):
+        figure.savefig(out)
 
 
 def label_axes(

@@ -31,6 +31,7 @@ from neurosim_core.data.sources import numbered
 from neurosim_core.flight import header_of
 from neurosim_core.packets import Collision, Events, Image, Odometry, Packet
 from neurosim_core.record import RecordingWriter
+from neurosim_core.record.disk import naming_file
 from neurosim_core.render.launch import core_count, limit_cores
 from neurosim_core.sim.model import Model, make_model, refit
 from neurosim_core.sim.rollout import run_model
@@ -137,7 +138,8 @@ def prepare(plan: DatasetPlan) -> None:
             )
     elif plan.folder.exists() and any(plan.folder.iterdir()):
         raise FileExistsError(f"{plan.folder} is not empty, and holds no data set: name another folder")
-    (plan.folder / "flights").mkdir(parents=True, exist_ok=True)
+    with naming_file(plan.folder):
+        (plan.folder / "flights").mkdir(parents=True, exist_ok=True)
     for left in (plan.folder / "flights").glob(".*.part"):
         left.unlink()
     write_whole(described, plan.description.encode())
@@ -262,5 +264,6 @@ def _sha256(file: Any) -> str:
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file that is there as a whole or not at all."""
     part = path.with_name(f".{path.name}.part")
-    part.write_bytes(data)
-    part.replace(path)
+    with naming_file(path):
+        part.write_bytes(data)
+        part.replace(path)

@@ -186,6 +186,7 @@ def draw_fit(fit: SensorFit, out: Path) -> None:
     import numpy as np
 
     from neurosim_core.data.compare import label_axes, new_figure
+    from neurosim_core.record.disk import naming_file
 
     figure = new_figure(14.0, 4.2)
     rates, intervals, steps = figure.subplots(1, 3)
@@ -212,4 +213,5 @@ def draw_fit(fit: SensorFit, out: Path) -> None:
         steps.text(0.5, 0.5, "no recording of steps", ha="center", transform=steps.transAxes)
     rates.legend(frameon=False, fontsize=9)
     intervals.legend(frameon=False, fontsize=9)
-    figure.savefig(out)
+    with naming_file(out):
+        figure.savefig(out)

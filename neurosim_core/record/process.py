@@ -86,6 +86,17 @@ def start_process() -> None:
         _spare.append(_Process())
 
 
+def _take_process() -> _Process:
+    """Return the process that waits for a recording, or a new one: what waits long may have been killed."""
+    while _spare:
+        process = _spare.pop()
+        if process.popen.poll() is None:
+            return process
+        process.socket.close()
+        process.popen.communicate()  # closes the pipe
+    return _Process()
+
+
 class RecordingProcess:
     """Writes packets to a file as `RecordingWriter` does, in a process of its own.
 
@@ -105,7 +116,7 @@ class RecordingProcess:
         self._path = path
         self.kept_ns: int | None = None
         """When writing has failed: the file holds the packets up to this stamp [ns]; None: unknown."""
-        self._process = _spare.pop() if _spare else _Process()
+        self._process = _take_process()
         self._failure: Exception | None = None
         self._closed = False
         self._classes: dict[type[Packet], tuple[int, tuple[str, ...]]] = {}

@@ -18,6 +18,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 from trimesh.intersections import slice_faces_plane
 
+from neurosim_core.record.disk import naming_file
 from neurosim_core.render.camera import PinholeConfig
 from neurosim_core.render.config import LightingConfig, RenderConfig
 from neurosim_core.render.renderer import make_renderer, take_picture, upload_scene
@@ -120,8 +121,9 @@ def report_scene(file: Path | Scene, out: Path | None = None, *, console: Consol
     if not isinstance(file, Scene):
         notes.append(f"Loaded in {loaded_s:.2f} s.")
     out = Path(f"{scene.name}.png") if out is None else out
-    out.parent.mkdir(parents=True, exist_ok=True)
-    scene_picture(scene, space).save(out)
+    with naming_file(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        scene_picture(scene, space).save(out)
     for note in (*notes, f"Picture: {out}"):
         console.print(f"- {note}", markup=False, highlight=False, soft_wrap=True)
 

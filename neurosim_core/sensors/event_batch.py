@@ -197,7 +197,8 @@ class EventCameraBatch:
             raise RuntimeError("reset() must be called before a frame is fed")
         if not 0 < stamp_ns - start_ns < self.span_max_ns:
             raise ValueError(
-                f"stamp_ns must be within {self.span_max_ns / 1e9:g} s after {start_ns}, got {stamp_ns}"
+                f"stamp_ns must be later than {start_ns}, that of the frame before, by less than "
+                f"{self.span_max_ns / 1e9:g} s, got {stamp_ns}"
             )
         address, held = self._locate(log_radiance)
         self._begin_frame(start_ns, stamp_ns)

@@ -19,7 +19,7 @@ import h5py
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from processes import children_of, wait_for
+from processes import children_of, gone, wait_for
 from test_hdf5 import HEADER, MS, assert_same, image, make_events, make_flight, write
 
 from neurosim_core.packets import Events, FieldSpec, Packet
@@ -200,6 +200,28 @@ writer.close()
         assert [packet.stamp_ns for packet in flight.packets()] == [*range(int(kept_ns) + 1)]
 
 
+@pytest.fixture
+def none_waits(tmp_path_factory):
+    """No process waits for a recording: one that a test before has left takes this one."""
+    RecordingProcess(tmp_path_factory.mktemp("left") / "f.h5", HEADER).close()
+
+
+@pytest.mark.usefixtures("none_waits")
+def test_a_process_that_is_killed_while_it_waits_is_replaced(tmp_path):
+    before = children_of(os.getpid())
+    start_process()
+    (pid,) = children_of(os.getpid()) - before
+    os.kill(pid, signal.SIGKILL)
+    wait_for(lambda: gone(pid))
+    writer = RecordingProcess(tmp_path / "f.h5", HEADER)
+    writer.write(PACKETS[0])
+    writer.close()
+    with Recording(tmp_path / "f.h5") as flight:
+        assert flight.clean
+        assert len([*flight.packets()]) == 1
+
+
+@pytest.mark.usefixtures("none_waits")
 def test_a_writer_that_is_killed_is_noticed(tmp_path):
     before = children_of(os.getpid())
     writer = RecordingProcess(tmp_path / "f.h5", HEADER)
@@ -213,6 +235,7 @@ def test_a_writer_that_is_killed_is_noticed(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="which processes there are, only Linux says in files")
+@pytest.mark.usefixtures("none_waits")
 def test_a_compressor_that_is_killed_is_noticed(tmp_path):
     before = children_of(os.getpid())
     writer = RecordingProcess(tmp_path / "f.h5", HEADER)
@@ -229,6 +252,7 @@ def test_a_compressor_that_is_killed_is_noticed(tmp_path):
         assert not flight.clean
 
 
+@pytest.mark.usefixtures("none_waits")
 def test_writing_waits_for_a_process_that_stands_still(tmp_path):
     """Without end neither memory grows nor anything is lost."""
     packets = [image(stamp_ns=k, shape=(1000, 1000, 4)) for k in range(30)]  # 4 MB each
