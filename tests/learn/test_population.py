@@ -32,6 +32,7 @@ CONFIG = TrainConfig(
     student=DaggerConfig(worlds=4, iterations=2, horizon=4, updates=1, batch=4, widths=(4, 4, 4)),
     pixels=8,
     evaluation_worlds=2,
+    rate_hz=10.0,  # few steps in an episode
 )
 TRAIN_AS_CONFIGURED = """
 import sys
