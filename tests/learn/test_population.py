@@ -48,21 +48,27 @@ def quiet(monkeypatch):
     monkeypatch.setenv("RAY_worker_niceness", "0")
 
 
-def test_seeds_on_a_cluster_are_those_of_this_process(tmp_path):
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """The folder of a training in this process."""
+    folder = tmp_path_factory.mktemp("alone")
+    train(folder, CONFIG, say=lambda line: None)
+    return folder
+
+
+def test_seeds_on_a_cluster_are_those_of_this_process(tmp_path, alone):
     configs = {f"seed-{seed}": dataclasses.replace(CONFIG, seed=seed) for seed in (3, 4)}
     said: list[str] = []
     train_population(tmp_path, configs, address="local", say=said.append)
     assert sorted(line.split(":")[0] for line in said) == ["seed-3", "seed-3", "seed-4", "seed-4"]
-    here = tmp_path / "here"
-    train(here, configs["seed-4"], say=said.append)
-    policies = [folder / "policy.onnx" for folder in (here, tmp_path / "seed-4", tmp_path / "seed-3")]
+    policies = [folder / "policy.onnx" for folder in (alone, tmp_path / "seed-3", tmp_path / "seed-4")]
     alike, other = (policies[0].read_bytes() == policy.read_bytes() for policy in policies[1:])
     assert alike
     assert not other
     assert list((tmp_path / "seed-3").glob("events.out.tfevents.*"))
 
 
-def test_two_workers_of_a_cluster_train_one_policy_as_torchrun_does(tmp_path):
+def test_two_workers_of_a_cluster_train_one_policy_as_torchrun_does(tmp_path, alone):
     said: list[str] = []
     train_population(tmp_path, {"both": CONFIG}, address="local", workers=2, say=said.append)
     assert len(said) == 2
@@ -80,12 +86,11 @@ def test_two_workers_of_a_cluster_train_one_policy_as_torchrun_does(tmp_path):
         capture_output=True,
         timeout=900,
     )
-    train(tmp_path / "alone", CONFIG, say=said.append)
-    both, other, alone = (
-        (tmp_path / run / "policy.onnx").read_bytes() for run in ("both", "torchrun", "alone")
+    both, other, one = (
+        (run / "policy.onnx").read_bytes() for run in (tmp_path / "both", tmp_path / "torchrun", alone)
     )
     assert both == other
-    assert both != alone
+    assert both != one
 
 
 class Placed(ValueError):
