@@ -259,9 +259,10 @@ def _facts(c: Conversion) -> list[tuple[str, str]]:
     whole = (plan.crop.width, plan.crop.height) == (source.width, source.height)
     part = "" if whole else f", of which {plan.crop}"
     rate_hz = (c.frame_count - 1) / duration_s
-    longest_ms, shortest_ms = 1e-6 * c.interval_max_ns, 1e-6 * c.interval_min_ns
-    even = c.interval_max_ns - c.interval_min_ns <= 1_000_000
-    intervals = f"every {1e3 / rate_hz:.3g} ms" if even else f"every {shortest_ms:.3g} to {longest_ms:.3g} ms"
+    ends_ms = [1e3 / rate_hz]
+    if c.interval_max_ns - c.interval_min_ns > 1_000_000:
+        ends_ms = [1e-6 * c.interval_min_ns, 1e-6 * c.interval_max_ns]
+    intervals = f"every {' to '.join(f'{ms:,.0f}' if ms >= 1e3 else f'{ms:.3g}' for ms in ends_ms)} ms"
     event_rate = c.event_count / duration_s / 1e6
     on_share = c.on_count / c.event_count if c.event_count else 0.0
     return [

@@ -301,6 +301,18 @@ def test_what_was_converted_before_a_bad_frame_is_kept(tmp_path):
         assert flight.packet_count("events") == 3  # the intervals between the four frames before it
 
 
+@pytest.mark.parametrize(
+    ("times_s", "told"), [([0, 30, 60, 90], "every 30,000 ms"), ([0, 0.1, 0.4, 2], "every 100 to 1,600 ms")]
+)
+def test_the_command_says_long_intervals_in_full(tmp_path, capsys, times_s, told):
+    """As of two pictures of a still surface."""
+    folder = write_folder(tmp_path / "f", [moving_pictures(1, width=8, height=6)[0]] * 4)
+    np.savetxt(tmp_path / "times.txt", times_s)
+    line = ["convert", str(folder), str(tmp_path / "e.h5"), "--timestamps", str(tmp_path / "times.txt")]
+    assert cli.main([*line, "--device", "cpu"]) == 0
+    assert told in capsys.readouterr().out
+
+
 def test_the_command_writes_a_file_that_says_where_it_is_from(tmp_path, capsys):
     video = write_video(tmp_path / "v.mkv", moving_pictures(4, width=40, height=30), [0, 20, 40, 60])
     out = tmp_path / "e.h5"
