@@ -25,7 +25,7 @@ from neurosim_core.scene.bodies import BodyConfig
 from neurosim_core.scene.config import SceneConfig
 from neurosim_core.scene.freespace import FreeSpaceConfig
 from neurosim_core.scene.mesh import DEFAULT_KIND, scene_kind
-from neurosim_core.sensors.base import SensorConfig, expand_stereo
+from neurosim_core.sensors.base import CameraConfig, SensorConfig
 from neurosim_core.sensors.depth import DepthSensorConfig
 from neurosim_core.sensors.event_camera import EventSensorConfig
 from neurosim_core.sensors.imu import ImuConfig
@@ -71,7 +71,30 @@ AnyController = Annotated[ControllerConfig, OfKind("controller", default=_DEFAUL
 AnySink = Annotated[SinkConfig, OfKind("sink")]
 AnyRenderer = Annotated[RendererConfig, OfKind("renderer", default=_DEFAULT_KINDS["renderer"])]
 _PATHS: tuple[type[BaseConfig], ...] = get_args(get_args(PathConfig)[0])
-Sensors = Annotated[dict[Name, AnySensor], AfterValidator(expand_stereo)]
+
+
+def _expand_stereo(sensors: Mapping[str, SensorConfig]) -> dict[str, SensorConfig]:
+    """Return sensors with two cameras in place of each that has `stereo`.
+
+    Raises:
+        ValueError: A name of the pair is taken.
+    """
+    expanded: dict[str, SensorConfig] = {}
+    for name, sensor in sensors.items():
+        if not isinstance(sensor, CameraConfig) or sensor.stereo is None:
+            expanded[name] = sensor
+            continue
+        for taken in {f"{name}_left", f"{name}_right"} & sensors.keys():
+            raise ValueError(f"{name}.stereo makes a camera {taken!r}, and there is one of this name")
+        right = sensor.mount.rotation().apply([0.0, -sensor.stereo.baseline_m, 0.0])
+        position_m = tuple(float(a + b) for a, b in zip(sensor.mount.position_m, right, strict=True))
+        mounts = {"left": sensor.mount, "right": sensor.mount.model_copy(update={"position_m": position_m})}
+        for side, mount in mounts.items():
+            expanded[f"{name}_{side}"] = sensor.model_copy(update={"mount": mount, "stereo": None})
+    return expanded
+
+
+Sensors = Annotated[dict[Name, AnySensor], AfterValidator(_expand_stereo)]
 Links = dict[Name, LinkConfig]
 
 STREAMS = ("odometry", "rotor_speeds", "command")

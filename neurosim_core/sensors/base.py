@@ -209,27 +209,6 @@ class CameraConfig(RenderedConfig):
         return self.lens
 
 
-def expand_stereo(sensors: Mapping[str, SensorConfig]) -> dict[str, SensorConfig]:
-    """Return sensors with two cameras in place of each that has `stereo`.
-
-    Raises:
-        ValueError: A name of the pair is taken.
-    """
-    expanded: dict[str, SensorConfig] = {}
-    for name, sensor in sensors.items():
-        if not isinstance(sensor, CameraConfig) or sensor.stereo is None:
-            expanded[name] = sensor
-            continue
-        for taken in {f"{name}_left", f"{name}_right"} & sensors.keys():
-            raise ValueError(f"{name}.stereo makes a camera {taken!r}, and there is one of this name")
-        right = sensor.mount.rotation().apply([0.0, -sensor.stereo.baseline_m, 0.0])
-        position_m = tuple(float(a + b) for a, b in zip(sensor.mount.position_m, right, strict=True))
-        mounts = {"left": sensor.mount, "right": sensor.mount.model_copy(update={"position_m": position_m})}
-        for side, mount in mounts.items():
-            expanded[f"{name}_{side}"] = sensor.model_copy(update={"mount": mount, "stereo": None})
-    return expanded
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PictureContext:
     """The context that the processing of the pictures of one sensor is made in."""

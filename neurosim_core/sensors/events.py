@@ -147,16 +147,8 @@ class EventCamera:
         scan_count = ring_size if self.device.is_cuda and not self._in_place else scan_count_max
         self._idle = deque(self._make_scan(16) for _ in range(scan_count))
         self._under_way: deque[Scan] = deque()
-        self._readout: Readout | None = None
-        if config.readout is not None:
-            self._readout = Readout(
-                config.readout,
-                height=height,
-                layout=states.layout,
-                seed=seed,
-                sensor=sensor,
-            )
-
+        arbiter: dict[str, Any] = {"height": height, "layout": states.layout, "seed": seed, "sensor": sensor}
+        self._readout = None if config.readout is None else Readout(config.readout, **arbiter)
         size: dict[str, Any] = {"width": width, "height": height, "device": device}
         new_stepper = functools.partial(EventCameraBatch, config, count=1, sensor=sensor, seed=seed, **size)
         self._make_stepper = functools.cache(new_stepper)
