@@ -12,7 +12,7 @@ import shutil
 import socket
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -128,10 +128,14 @@ def test_python_reports_what_it_has_not_heard_the_end_of(leavers):
         leavers.speak()
         leavers.leave()
         for number, reader in enumerate(readers):
+
+            def counted(reader: Any = reader) -> dict[str, int]:
+                take_all(reader)
+                return {name: getattr(reader.counters, name) for name in COUNTERS}
+
+            wait_for(lambda number=number, counted=counted: counted() == expected(number))
             wait_for(lambda reader=reader: not reader.sources() and not reader.carriers)
-            take_all(reader)
-            counted = {name: getattr(reader.counters, name) for name in COUNTERS}
-            assert counted == expected(number), number
+            assert counted() == expected(number)
             assert reader.stats().cut_off == reader.counters.cut_off
 
 

@@ -279,7 +279,7 @@ def test_rough_air_and_a_noisy_camera_fly_as_in_one_process(rough, shared_runtim
     state = make_state(rough)
     expected = list(run_model(rough, state))
     assert {"gusts", "turbulence", "ground"} <= set(state.vehicle.terms)
-    noisy = state.groups[0].frames["events"].camera.terms
+    noisy = state.groups[0].frames["events"].terms
     assert noisy == ("spread", "lin_log", "low_pass", "refractory", "leak", "spontaneous")
     assert state.counts["ticks left out"] > 100
     assert sum(len(p.t) for p in expected if p.sensor == "events") > 1000
