@@ -76,9 +76,9 @@ def measure_loop(config: engine.SimulationConfig, *, seconds: float) -> Row:
     row: Row = {"mode": config.live.mode, "requested [Hz]": config.control.rate_hz}
     row["received [Hz]"] = 1e9 * (len(trace.received_ns) - 1) / float(np.ptp(trace.received_ns))
     if config.live.mode == "lockstep":
-        # the last command that answers an earlier stamp is the one that an image has felt
-        felt = np.searchsorted(trace.answered_ns, trace.image_stamp_ns) - 1
-        latency_s = 1e-9 * (trace.received_ns - trace.sent_ns[felt])[felt >= 0]
+        # the last command that answers an earlier stamp is the one that an image shows
+        shown = np.searchsorted(trace.answered_ns, trace.image_stamp_ns) - 1
+        latency_s = 1e-9 * (trace.received_ns - trace.sent_ns[shown])[shown >= 0]
         row["command to image [ms]"], row["99 % [ms]"] = 1e3 * np.quantile(latency_s, [0.5, 0.99])
     row["transport [ms]"], row["its 99 % [ms]"] = 1e3 * np.quantile(transport_s, [0.5, 0.99])
     row |= {"images": len(trace.received_ns), "bytes": trace.image_bytes}

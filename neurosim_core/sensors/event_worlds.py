@@ -179,7 +179,7 @@ class WorldEventCamera(FrameSensor):
         offsets, count, present = self._offsets(offsets_ns), len(stamps_ns), self.present
         if stamps_ns:
             self._seen_ns, self.present = stamps_ns[-1], 1 - present
-        return Launches((offsets_ns, present), lambda: self._find(offsets, count, present))
+        return Launches((offsets_ns, present, frames.ptr), lambda: self._find(offsets, count, present))
 
     def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None, *, reset_ns: int = 0) -> None:
         """Draw what stays in the pixels of some worlds anew; see `PixelStates.seed`."""

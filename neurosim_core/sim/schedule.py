@@ -74,7 +74,7 @@ class Schedule:
     """Clocks of the groups."""
     instants_per_launch: int
     """The most instants of one group in one batch; of a sparse group, times TICKS_PER_INSTANT."""
-    images: Mapping[str, Rate] = field(default_factory=dict)
+    images: Mapping[str, Rate] = field(default_factory=dict, hash=False)
     """Clocks of the image sensors, by name: each one's ticks are ticks of its group."""
     sparse: frozenset[int] = frozenset()
     """Indices of the groups that render only some of their ticks."""
