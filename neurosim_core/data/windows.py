@@ -8,6 +8,7 @@ and counted.
 
 from __future__ import annotations
 
+import functools
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -87,6 +88,12 @@ def field_of(schema: PacketSchema, encoding: str) -> str | None:
     return named or _ENCODINGS.get(encoding)
 
 
+@functools.cache
+def _field_of_packets(kind: Any, encoding: str) -> str | None:
+    """Return `field_of` of a class, which is asked for each packet."""
+    return field_of(schema_of(kind), encoding)
+
+
 def value_of(packet: Packet) -> Any:
     """Return what a packet that is no event gives to its field."""
     if isinstance(packet, ImuSample):
@@ -122,7 +129,8 @@ class PacketWindows:
 
     def add(self, packet: Packet) -> Iterator[Sample]:
         """Take a packet, and yield the windows that are complete with it."""
-        name = field_of(schema_of(type(packet)), getattr(packet, "encoding", ""))
+        kind: Any = type(packet)  # mypy does not take classes for hashable
+        name = _field_of_packets(kind, getattr(packet, "encoding", ""))
         if name is None or self._watched.get(name) != packet.sensor:
             return
         if isinstance(packet, Events):
