@@ -62,11 +62,10 @@ def _choose(model: Model, state: State, batch: Batch) -> list[list[int]]:
     chosen: list[list[int]] = []
     for index, group in enumerate(state.groups):
         group.watching &= batch.wanted
-        always = any(name in batch.wanted for name in group.frames)
         due = [
             place
             for place, boundary in enumerate(batch.boundaries)
-            if index in boundary.groups and (always or is_due(group, boundary.stamp_ns, batch.wanted))
+            if index in boundary.groups and is_due(group, boundary.stamp_ns, batch.wanted)
         ]
         if group.rule is not None and due:
             with state.pipeline.choice(batch.number):
