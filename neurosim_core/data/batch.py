@@ -219,7 +219,9 @@ def collate(samples: Sequence[Sample]) -> Batch:
     for name, has in present.items():
         if any(has) != all(has):
             missing = next(sample.source for sample, h in zip(samples, has, strict=True) if not h)
-            raise ValueError(f"{missing} has no {name}, which others have: fields= says what to take")
+            raise ValueError(
+                f"{missing} has no {name}, but other samples have: select common fields by fields="
+            )
     stamp_ns = np.array([sample.stamp_ns for sample in samples], np.int64)
     start_ns = np.array([sample.start_ns for sample in samples], np.int64)
     events = None

@@ -73,7 +73,7 @@ class LiveSource:
                     time.sleep(_POLL_S)
             if not started:
                 raise TimeoutError(
-                    "no simulator sends the sensors that are wanted; one that streams waits for its first "
+                    "no simulator publishes the requested sensors; a streaming simulator waits for its first "
                     "command, which `neurosim fly` sends"
                 )
             for flight in flights:
