@@ -58,16 +58,11 @@ class RenderJob:
     """Buffers of the caller for pictures, by camera and stamp."""
 
 
-def _choose_boundaries(model: Model, state: State, batch: Batch) -> list[list[int]]:
+def _choose_boundaries(model: Model, state: State, batch: Batch) -> list[Sequence[int]]:
     """Return the boundaries of a batch that each group renders; adaptive groups wait for the motion."""
-    chosen: list[list[int]] = []
+    chosen: list[Sequence[int]] = []
     for index, group in enumerate(state.groups):
-        group.referenced &= batch.enabled_cameras
-        due = [
-            place
-            for place, boundary in enumerate(batch.boundaries)
-            if index in boundary.groups and is_due(group, boundary.stamp_ns, batch.enabled_cameras)
-        ]
+        due = due_places(group, batch, index)
         if group.rule is not None and due:
             with state.pipeline.choice(batch.number):
                 due = _choose_adaptive(model, state, batch, group, due)
@@ -84,7 +79,7 @@ def _choose_adaptive(
     the last tick of the run, and the first tick of a camera. The rule moves on to the end of the batch.
     """
     assert group.rule is not None
-    stamps_ns = [batch.boundaries[place].stamp_ns for place in due]
+    stamps_ns = [batch.stamps_ns[place] for place in due]
     enabled = [name for name in group.frames if name in batch.enabled_cameras]
     required = [model.config.sensors[name].packets for name in enabled]
     last_ns = group.rate.stamp_ns(group.rate.first_tick(model.duration_ns + 1) - 1)
@@ -97,9 +92,13 @@ def _choose_adaptive(
     return [due[place] for place in places]
 
 
-def is_due(group: RenderGroupState, stamp_ns: int, enabled: Collection[str]) -> bool:
-    """Return whether an enabled camera of a group has to be rendered at a tick of the group."""
-    return any(name in enabled for name in group.frames) or bool(pictures_due(group, stamp_ns, enabled))
+def due_places(group: RenderGroupState, batch: Batch, index: int) -> Sequence[int]:
+    """Return the boundaries at which enabled cameras of a group are due; others lose their reference."""
+    group.referenced &= batch.enabled_cameras
+    places = batch.stretch.group_places.get(index, ())
+    if batch.enabled_cameras.isdisjoint(group.frames):  # a frame sensor needs every tick
+        places = [p for p in places if pictures_due(group, batch.stamps_ns[p], batch.enabled_cameras)]
+    return places
 
 
 def pictures_due(group: RenderGroupState, stamp_ns: int, enabled: Collection[str]) -> list[str]:
@@ -126,18 +125,19 @@ def plan_job(state: State, batch: Batch, index: int, places: Sequence[int]) -> R
     """Return the job of a group that renders some boundaries of a batch, at least one."""
     group, buffer_index = state.groups[index], batch.number % state.pipeline.in_flight
     slots = tuple(batch.slot + place for place in places)
-    stamps_ns = [batch.boundaries[place].stamp_ns for place in places]
+    stamps_ns = [batch.stamps_ns[place] for place in places]
     pictures = []
-    image_slots = []
+    image_slots = [-1] * len(places)
     used = 0
-    for instant, stamp_ns in enumerate(stamps_ns):
-        due = pictures_due(group, stamp_ns, batch.enabled_cameras) if group.images else ()
+    for instant, stamp_ns in enumerate(stamps_ns if group.images else ()):
+        due = pictures_due(group, stamp_ns, batch.enabled_cameras)
         pictures += [
             (stamp_ns, instant if group.images[name].output in INSTANT_OUTPUTS else used, name)
             for name in due
         ]
-        image_slots.append(used if due else -1)
-        used += bool(due)
+        if due:
+            image_slots[instant] = used
+            used += 1
     posed, placed = slots, tuple(image_slots)
     pattern: Hashable | None = None
     if group.only_launches:
@@ -287,7 +287,7 @@ def _begin(
 
 def _is_all_in_place(batch: Batch) -> bool:
     """Return whether no run ends in the batch, and its only packets are pictures in buffers of the caller."""
-    return batch.until_ns == batch.boundaries[-1].stamp_ns and all(
+    return batch.until_ns == batch.stamps_ns[-1] and all(
         not job.frames and len(job.picture_buffers) == len(job.pictures) for job in batch.jobs or ()
     )
 
