@@ -168,8 +168,8 @@ def make_state(
         model: What does not change.
         in_flight: How many batches `run_model` keeps in flight. By default 5 on a CUDA device, and 1 where a
             launch returns when it has finished. It changes no packet.
-        render_backlog: How many batches of `integrate_period` may wait for `render_batch`; by default
-            `in_flight`.
+        render_backlog: How many batches of `integrate_period` may wait for `render_batch`: at least
+            `in_flight`, which is the default.
         borrow_pictures: Do not copy pictures: with one batch in flight, each is valid until the next `step`
             or `render_batch`; those that a step would overwrite itself are copied.
         allocate_picture: Gives a buffer to copy a picture to, where the caller has one; called before
