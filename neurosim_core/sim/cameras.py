@@ -57,16 +57,11 @@ class RenderJob:
     """Buffers of the caller that pictures are copied to, by camera and stamp."""
 
 
-def _choose(model: Model, state: State, batch: Batch) -> list[list[int]]:
+def _choose(model: Model, state: State, batch: Batch) -> list[Sequence[int]]:
     """Return which boundaries of a batch each group has to render; adaptive groups wait for the flight."""
-    chosen: list[list[int]] = []
+    chosen: list[Sequence[int]] = []
     for index, group in enumerate(state.groups):
-        group.watching &= batch.wanted
-        due = [
-            place
-            for place, boundary in enumerate(batch.boundaries)
-            if index in boundary.groups and is_due(group, boundary.stamp_ns, batch.wanted)
-        ]
+        due = due_places(group, batch, index)
         if group.rule is not None and due:
             with state.pipeline.choice(batch.number):
                 due = _choose_ticks(model, state, batch, group, due)
@@ -83,7 +78,7 @@ def _choose_ticks(
     run, and the first tick that a camera sees. The rule moves on to the end of the batch.
     """
     assert group.rule is not None
-    stamps_ns = [batch.boundaries[place].stamp_ns for place in due]
+    stamps_ns = [batch.stamps_ns[place] for place in due]
     looking = [name for name in group.frames if name in batch.wanted]
     required = [model.config.sensors[name].packets for name in looking]
     last_ns = group.rate.stamp_ns(group.rate.first_tick(model.duration_ns + 1) - 1)
@@ -96,9 +91,13 @@ def _choose_ticks(
     return [due[place] for place in places]
 
 
-def is_due(group: RenderGroupState, stamp_ns: int, wanted: Collection[str]) -> bool:
-    """Return whether a camera that is wanted sees the tick of a group."""
-    return any(name in wanted for name in group.frames) or bool(pictures_due(group, stamp_ns, wanted))
+def due_places(group: RenderGroupState, batch: Batch, index: int) -> Sequence[int]:
+    """Return the boundaries at which cameras of a group look; cameras that are not wanted stop watching."""
+    group.watching &= batch.wanted
+    places = batch.stretch.group_places.get(index, ())
+    if batch.wanted.isdisjoint(group.frames):  # a frame sensor would see each tick
+        places = [place for place in places if pictures_due(group, batch.stamps_ns[place], batch.wanted)]
+    return places
 
 
 def pictures_due(group: RenderGroupState, stamp_ns: int, wanted: Collection[str]) -> list[str]:
@@ -125,18 +124,19 @@ def plan_job(state: State, batch: Batch, index: int, places: Sequence[int]) -> R
     """Return how a group renders some boundaries of a batch, at least one."""
     group, buffer_index = state.groups[index], batch.number % state.pipeline.in_flight
     slots = tuple(batch.slot + place for place in places)
-    stamps_ns = [batch.boundaries[place].stamp_ns for place in places]
+    stamps_ns = [batch.stamps_ns[place] for place in places]
     pictures = []
-    image_slots = []
+    image_slots = [-1] * len(places)
     used = 0
-    for instant, stamp_ns in enumerate(stamps_ns):
-        due = pictures_due(group, stamp_ns, batch.wanted) if group.images else ()
+    for instant, stamp_ns in enumerate(stamps_ns if group.images else ()):
+        due = pictures_due(group, stamp_ns, batch.wanted)
         pictures += [
             (stamp_ns, instant if group.images[name].output in INSTANT_OUTPUTS else used, name)
             for name in due
         ]
-        image_slots.append(used if due else -1)
-        used += bool(due)
+        if due:
+            image_slots[instant] = used
+            used += 1
     posed, placed = slots, tuple(image_slots)
     pattern: Hashable | None = None
     if group.only_launches:
@@ -285,7 +285,7 @@ def _begin(
 
 def _is_all_in_place(batch: Batch) -> bool:
     """Return whether the whole batch counts, and yields only pictures in buffers of the caller."""
-    return batch.until_ns == batch.boundaries[-1].stamp_ns and all(
+    return batch.until_ns == batch.stamps_ns[-1] and all(
         not job.frames and len(job.picture_buffers) == len(job.pictures) for job in batch.jobs or ()
     )
 

@@ -112,7 +112,7 @@ def plan_batch(state: State, stretch: Stretch, *, closed_loop: bool, begins: Any
     slot_count = state.trace.arrays.states.shape[0] // state.pipeline.flown_ahead
     return Batch(
         stretch=stretch,
-        boundaries=[Boundary(begin_ns + b[0], *b[1:]) for b in stretch.boundaries],
+        stamps_ns=[begin_ns + boundary.stamp_ns for boundary in stretch.boundaries],
         closed_loop=closed_loop,
         step_count=sum(-(-span_ns // max_step_ns) for span_ns in stretch.elapsed_ns),
         command_count=sum(boundary.control for boundary in stretch.boundaries) if closed_loop else 0,
@@ -150,7 +150,7 @@ def integrate(state: State, batch: Batch) -> None:
     vehicle, trace, slot = state.vehicle, state.trace, batch.slot
     for boundary, span_ns, count in _spans(batch.stretch, joined=trace.joins_spans):
         end = slot + count
-        record = {"first": slot == batch.slot, "last": end == batch.slot + len(batch.boundaries)}
+        record = {"first": slot == batch.slot, "last": end == batch.slot + len(batch.stamps_ns)}
         trace.advance(slot, elapsed_ns, span_ns, count, **record)
         slot, elapsed_ns = end, elapsed_ns + count * span_ns
         for index in boundary.samplers:
@@ -176,17 +176,17 @@ def _spans(stretch: Stretch, *, joined: bool) -> Iterator[tuple[Boundary, int, i
 
 def fetch_flight(state: State, batch: Batch) -> None:
     """Launch the copy of what was flown and sampled to the host."""
-    state.trace.fetch(batch.slot, len(batch.boundaries))
+    state.trace.fetch(batch.slot, len(batch.stamps_ns))
     for index, copies in enumerate(state.sampler_copies.values()):
-        sample_count = sum(index in boundary.samplers for boundary in batch.boundaries)
+        sample_count = len(batch.stretch.sampler_places.get(index, ()))
         for copy in copies.values():
             copy.fetch(batch.slot, sample_count)
 
 
 def read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
     """Return what was sampled in a batch that is flown, and collisions."""
-    rows = state.trace.numpy(batch.slot, len(batch.boundaries))
-    state.stamp_ns = batch.boundaries[-1].stamp_ns
+    rows = state.trace.numpy(batch.slot, len(batch.stamps_ns))
+    state.stamp_ns = batch.stamps_ns[-1]
     state.counts["steps"] += batch.step_count
     state.counts["commands"] += batch.command_count
     _count_redone(state, sum(rows.redone[-1].tolist()))  # of few vehicles: ufuncs take ten times as long
@@ -196,7 +196,7 @@ def read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
     packets = _collide(model, state, batch, rows)  # may end the run before the end of the batch
     batch.until_ns = state.stamp_ns
     packets += _read_samplers(state, batch)
-    reached = [b.stamp_ns for b in batch.boundaries if b.stamp_ns <= state.stamp_ns]
+    reached = [stamp_ns for stamp_ns in batch.stamps_ns if stamp_ns <= state.stamp_ns]
     if reached:
         row = rows.states[len(reached) - 1, 0]
         state.last = Odometry(
@@ -232,7 +232,7 @@ def _failure(state: State) -> DynamicsError:
 def _read_samplers(state: State, batch: Batch) -> list[Packet]:
     packets: list[Packet] = []
     for index, (name, copies) in enumerate(state.sampler_copies.items()):
-        stamps = [boundary.stamp_ns for boundary in batch.boundaries if index in boundary.samplers]
+        stamps = [batch.stamps_ns[place] for place in batch.stretch.sampler_places.get(index, ())]
         if not stamps:
             continue
         columns = {field: copy.rows(batch.slot, len(stamps))[:, 0] for field, copy in copies.items()}
@@ -256,14 +256,12 @@ def _collide(model: Model, state: State, batch: Batch, rows: TraceRows) -> list[
     if not any(margin_m <= 0.0 for margin_m in rows.clearance[:, 0].tolist()):
         state.touching = False
         return packets
-    for boundary, row, margin_m in zip(
-        batch.boundaries, rows.states[:, 0], rows.clearance[:, 0], strict=True
-    ):
+    for stamp_ns, row, margin_m in zip(batch.stamps_ns, rows.states[:, 0], rows.clearance[:, 0], strict=True):
         touching = bool(margin_m <= 0.0)
         if touching and not state.touching:
             packets.append(
                 Collision(
-                    stamp_ns=boundary.stamp_ns,
+                    stamp_ns=stamp_ns,
                     sequence=state.sequence[COLLISION],
                     sensor=COLLISION,
                     position=row[POSITION],
@@ -274,7 +272,7 @@ def _collide(model: Model, state: State, batch: Batch, rows: TraceRows) -> list[
             state.counts["collisions"] += 1
             if model.config.vehicle.on_collision == "end":
                 state.ended = True
-                state.stamp_ns = boundary.stamp_ns
+                state.stamp_ns = stamp_ns
                 return packets
         state.touching = touching
     return packets

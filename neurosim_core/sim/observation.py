@@ -59,7 +59,8 @@ def make_observation(state: State, stretch: Stretch) -> Observation:
     arrays = state.vehicle.arrays
     samples = {}
     for index, (name, sampler) in enumerate(state.samplers.items()):
-        offsets_ns = stretch.sample_offsets_ns(index)
+        places = stretch.sampler_places.get(index, ())
+        offsets_ns = tuple(stretch.boundaries[place].stamp_ns for place in places)
         samples[name] = Samples(
             arrays={field: _first(rows, len(offsets_ns)) for field, rows in sampler.arrays.items()},
             offsets_ns=offsets_ns,

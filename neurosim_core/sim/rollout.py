@@ -21,7 +21,7 @@ from neurosim_core.packets import Odometry, Packet
 from neurosim_core.runtime.timing import timed
 from neurosim_core.sim.cameras import (
     acquire_picture_buffers,
-    is_due,
+    due_places,
     pictures_due,
     plan_ahead,
     read_cameras,
@@ -268,11 +268,10 @@ def skip_batch(model: Model, state: State, batch: Batch) -> int:
     """
     count = 0
     for index, group in enumerate(state.groups):
-        group.watching &= batch.wanted
-        stamps = [b.stamp_ns for b in batch.boundaries if index in b.groups]
-        for stamp_ns in stamps:
-            count += is_due(group, stamp_ns, batch.wanted)
-            for name in pictures_due(group, stamp_ns, batch.wanted):
+        places = due_places(group, batch, index)
+        count += len(places)
+        for place in places:
+            for name in pictures_due(group, batch.stamps_ns[place], batch.wanted):
                 group.images[name].sequence += 1
     state.rendered_count += 1
     return count

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import NamedTuple
@@ -58,9 +58,24 @@ class Stretch:
             (span, b.control, b.samplers) for span, b in zip(self.elapsed_ns, self.boundaries, strict=True)
         )
 
-    def sample_offsets_ns(self, sampler: int) -> tuple[int, ...]:
-        """Return when a sampler reads the state [ns]."""
-        return tuple(b.stamp_ns for b in self.boundaries if sampler in b.samplers)
+    @functools.cached_property
+    def sampler_places(self) -> Mapping[int, Sequence[int]]:
+        """Boundaries at which each sampler reads the state, by the index of the sampler."""
+        return _places([boundary.samplers for boundary in self.boundaries])
+
+    @functools.cached_property
+    def group_places(self) -> Mapping[int, Sequence[int]]:
+        """Boundaries that each group sees, by the index of the group."""
+        return _places([boundary.groups for boundary in self.boundaries])
+
+
+def _places(due: Sequence[tuple[int, ...]]) -> dict[int, list[int]]:
+    """Return where each index is due."""
+    places: dict[int, list[int]] = {}
+    for place, indices in enumerate(due):
+        for index in indices:
+            places.setdefault(index, []).append(place)
+    return places
 
 
 @dataclass(frozen=True, kw_only=True)

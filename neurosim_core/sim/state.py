@@ -32,7 +32,7 @@ from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import WorldSettings
 from neurosim_core.sim.render_group import PictureAllocator, RenderGroupState, make_render_groups
 from neurosim_core.sim.scene_table import single_scene
-from neurosim_core.sim.schedule import Boundary, Stretch
+from neurosim_core.sim.schedule import Stretch
 from neurosim_core.sim.trace import Trace, WorldArrays, make_surfaces
 from neurosim_core.vehicle import DynamicsError
 from neurosim_core.vehicle.base import Vehicle, VehicleContext
@@ -64,8 +64,8 @@ class Batch:
 
     stretch: Stretch
     """What happens in it, relative to its begin."""
-    boundaries: Sequence[Boundary]
-    """The same at their stamps in the run."""
+    stamps_ns: Sequence[int]
+    """Stamps of its boundaries in the run [ns]."""
     closed_loop: bool
     """The path controller commands."""
     step_count: int
