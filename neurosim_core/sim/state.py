@@ -172,8 +172,8 @@ def make_state(
         model: The model of the run.
         in_flight: Number of batches that `run_model` keeps in flight. By default 5 on a CUDA device, and 1
             where launches are synchronous. It does not change the packets.
-        render_backlog: Number of batches of `integrate_period` that may wait for `render_batch`; by default
-            `in_flight`.
+        render_backlog: Number of batches of `integrate_period` that may wait for `render_batch`: at least
+            `in_flight`, which is the default.
         borrow_pictures: Return pictures as views, without a copy. With one batch in flight, a picture is
             valid until the next `step` or `render_batch`; pictures that the same step overwrites are copied.
         allocate_picture: Returns a buffer of the caller for a picture, or None; called before pictures are
