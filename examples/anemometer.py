@@ -18,7 +18,6 @@ class Airflow(ns.Packet):
     """Velocity of the air against the vehicle, in B [m/s]."""
 
 
-# annotations must be objects: a file with such a function has no `from __future__ import annotations`
 @wp.func
 def _read_air(scale: wp.float64, motion: ns.sensors.Motion, world: int, output: int) -> wp.vec3d:
     against = motion.air_velocity[world] - motion.velocity[world]

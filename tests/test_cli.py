@@ -151,7 +151,7 @@ def test_an_animation_of_events_alone_is_refused_and_says_what_can_be_made(flown
     assert cli.main(["view", str(file), "--save", str(tmp_path / "film.webp")]) == 1
     told = capsys.readouterr().err
     assert f"an animation needs pictures in colour, and {file} has none" in told
-    assert f"save what there is for Rerun, as {tmp_path / 'film.rrd'}" in told
+    assert f"save a file for Rerun, as {tmp_path / 'film.rrd'}" in told
     assert cli.main(["view", str(tmp_path / "nosuch"), "--save", str(tmp_path / "film.webp")]) == 1
     assert f"`neurosim run --out {tmp_path / 'nosuch'}` makes one" in capsys.readouterr().err
 

@@ -57,10 +57,10 @@ class SceneTable:
         """Return `dark_floor` or `exposure` of `SceneData` in each world, device array of float32, [world].
 
         Raises:
-            ValueError: Worlds share the light of their scene: they were not made with `own_light`.
+            ValueError: Worlds share the light of their scene: they were not made with `per_world_light`.
         """
         if self.data is None or len(self.data) != len(self.scene_of_world):
-            raise ValueError("the light is that of the scene in all worlds: make them with own_light=True")
+            raise ValueError("all worlds share the light of their scene: make them with per_world_light=True")
         offset = getattr(SceneData.ctype, name).offset
         size = wp.types.type_size_in_bytes(self.data.dtype)
         floats: Any = wp.array(
@@ -81,12 +81,12 @@ def make_scene_table(
     models: Sequence[Model] | None = None,
     scene_of_world: ArrayLike | None = None,
     lenses_differ: bool = False,
-    own_light: bool = False,
+    per_world_light: bool = False,
 ) -> SceneTable:
     """Load the scenes of `count` worlds and bring them to the device; without any, that of the configuration.
 
     `models` are scenes that were loaded before, each with its path and light. `scene_of_world` is the index
-    of each world's, shape [N]; by default they take turns. With `own_light` that of each world may be
+    of each world's, shape [N]; by default they take turns. With `per_world_light` that of each world may be
     changed.
 
     Raises:
@@ -108,7 +108,7 @@ def make_scene_table(
     if models is not None:
         _check_models(models, config)
     asked = isinstance(config.render.candidate_lists, CandidateListConfig)
-    if asked and (lenses_differ or own_light or len(scenes or models or ()) > 1):
+    if asked and (lenses_differ or per_world_light or len(scenes or models or ()) > 1):
         _logger.info("render.candidate_lists is left out: worlds differ in scenes, lenses or light")
         alone = config.render.model_copy(update={"candidate_lists": None})  # Embree may do it on a CPU
         config = config.model_copy(update={"render": alone})
@@ -125,15 +125,15 @@ def make_scene_table(
         raise ValueError(
             f"scene_of_world must be in [0, {len(made) - 1}], got {chosen.min()} to {chosen.max()}"
         )
-    return _table(made, chosen, own_light=own_light)
+    return _table(made, chosen, per_world_light=per_world_light)
 
 
 def single_scene(model: Model) -> SceneTable:
     """Return the table of one world in the scene of a model."""
-    return _table((model,), np.zeros(1, dtype=np.int64), own_light=False)
+    return _table((model,), np.zeros(1, dtype=np.int64), per_world_light=False)
 
 
-def _table(models: tuple[Model, ...], chosen: NDArray[Any], *, own_light: bool) -> SceneTable:
+def _table(models: tuple[Model, ...], chosen: NDArray[Any], *, per_world_light: bool) -> SceneTable:
     """Bring what worlds need of their scenes to the device; `chosen` is the scene of each world."""
     count = len(chosen)
     device = models[0].device
@@ -141,13 +141,13 @@ def _table(models: tuple[Model, ...], chosen: NDArray[Any], *, own_light: bool) 
     terms = None
     if arrays:
         terms = RenderTerms(*(max(values) for values in zip(*(a.terms for a in arrays), strict=True)))
-        terms = terms._replace(world_scenes=own_light or len(arrays) > 1)
+        terms = terms._replace(world_scenes=per_world_light or len(arrays) > 1)
     completed: tuple[SceneData, ...] = ()
     scene: Any = wp.array(chosen.astype(np.int32), dtype=int, device=device)
     row = scene
-    if arrays and (own_light or len(arrays) > 1):
+    if arrays and (per_world_light or len(arrays) > 1):
         completed = tuple(_completed(a) for a in arrays)
-    if own_light:
+    if per_world_light:
         completed = tuple(completed[index] for index in chosen)
         row = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=device)
     return SceneTable(

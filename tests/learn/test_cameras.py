@@ -194,7 +194,7 @@ def test_without_draws_nothing_is_made_for_them(make):
     env = make(drawn=NO_RANDOMISATION)
     assert not env.sim.optics(CAMERA)[2].numpy().any()
     assert "light_factor" not in env.parameters
-    with pytest.raises(ValueError, match="make them with own_light=True"):
+    with pytest.raises(ValueError, match="make them with per_world_light=True"):
         env.sim.light("exposure")
 
 
