@@ -206,7 +206,7 @@ def _add_call(commands: _Commands) -> None:
         "--position", type=float, nargs=3, metavar=("X", "Y", "Z"), help="start in the world [m]"
     )
     step = requests.add_parser("step", help="advance a paused run by some control periods")
-    step.add_argument("count", type=int, nargs="?", default=1)
+    step.add_argument("count", type=int, nargs="?", default=1, help="number of control periods (default: 1)")
     requests.add_parser("pause", help="pause simulated time")
     requests.add_parser("resume", help="resume simulated time")
     change = requests.add_parser("set", help="change settings of the run")

@@ -218,7 +218,9 @@ class SimulationConfig(BaseConfig):
                     known = ", ".join(dict.fromkeys([*sensors, *STREAMS]))
                     raise ValueError(f"links.{link}: vehicle {name!r} has no such link, known: {known}")
                 if link == "command" and (settings.clock_offset_s or settings.clock_drift_ppm):
-                    raise ValueError("links.command: a command has no clock of its own to be set off")
+                    raise ValueError(
+                        "links.command: clock_offset_s and clock_drift_ppm are for links of sensors"
+                    )
         return self
 
     def of(self, name: str) -> SimulationConfig:

@@ -33,7 +33,7 @@ MISTAKES = {
     "run --set scene=house.glb": "the file of a scene is scene: {kind: mesh, file: house.glb}",
     "run --set duration_s=4s": "--set duration_s: Input should be a valid number, got '4s'",
     "run --set sensors.events.lens.horizontal_fov_rad=90": "if these are degrees, write 1.5708",
-    "run --device cuda:7": "device: auto takes what there is",
+    "run --device cuda:7": "device: auto takes a GPU if there is one",
     "run film.mp4": "must hold a mapping",
     "scene house.glb": "house.glb: no such file",
     "scene bad.glb --out mm": "mm: the scene is drawn into a picture: mm.png",

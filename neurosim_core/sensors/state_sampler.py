@@ -320,9 +320,9 @@ class StateSampler(Sampler):
             self._add(_delay, motion, ring, length, at)
         if late is not None and late.dropout_probability > 0.0:
             stream = wp.uint32(stream_id(f"{context.name}/lost"))
-            came = self._zeros(wp.int32, *shape)
-            self._add(_lose, late.dropout_probability, stream, at, 0, came, slot_at=3)
-            self.arrays |= {"came": came}
+            received = self._zeros(wp.int32, *shape)
+            self._add(_lose, late.dropout_probability, stream, at, 0, received, slot_at=3)
+            self.arrays |= {"received": received}
         self._add(kernel, *inputs, at, 0, *written, slot_at=len(inputs) + 1)
 
     def _zeros(self, dtype: Any, *shape: int) -> Any:
@@ -352,9 +352,9 @@ class StateSampler(Sampler):
             launch.launch()
 
     def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Packet | None:
-        """Return one sample as a packet; None: it does not come."""
+        """Return one sample as a packet; None: the sample is lost."""
         values = {name: row if np.ndim(row) else row.item() for name, row in rows.items()}
-        if not values.pop("came", True):
+        if not values.pop("received", True):
             return None
         return self._packet(**values, **header)
 
@@ -419,8 +419,8 @@ def make_sampler(config: StateSensorConfig, context: SamplerContext) -> Sampler:
     arrays = getattr(made, "arrays", None)
     if not isinstance(arrays, Mapping):
         raise TypeError(
-            f"sensor {context.name!r}: {type(made).__qualname__} must set `self.arrays`, what it measures by "
-            f"name: device arrays of shape [slot, world, ...], here {shape}; got {arrays!r}"
+            f"sensor {context.name!r}: {type(made).__qualname__} must set `self.arrays`, its measurements "
+            f"by name: device arrays of shape [slot, world, ...], here {shape}; got {arrays!r}"
         )
     for field, array in arrays.items():
         if tuple(array.shape[:2]) != shape:
