@@ -202,7 +202,7 @@ def test_walks_that_cannot_be_shared(several, plain, textured, caplog):
         )
         for walk in ({}, {"candidate_lists": {}})
     ]
-    assert caplog.text.count("render.candidate_lists is left out") == 1
+    assert caplog.text.count("render.candidate_lists is not used") == 1
     commands = commands_of("rates", 3, 2)
     plainly, walking = (record(worlds, commands) for worlds in made)
     assert event_count(plainly) > 100
