@@ -1,4 +1,4 @@
-"""A task of one's own in one file: climb to a height above the start; prints how far off it ends.
+"""Train your own task in one file: climb to a height above the start. It prints the final error.
 
 python examples/custom_task.py            # a minute on a laptop; needs the extra `learn`
 """

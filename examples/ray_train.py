@@ -1,4 +1,4 @@
-"""Train depth from events with Ray: Ray Data prepares windows, Ray Train shares them among workers."""
+"""Train depth from events with Ray: Ray Data prepares windows, Ray Train distributes them to workers."""
 
 from __future__ import annotations
 

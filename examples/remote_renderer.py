@@ -1,7 +1,7 @@
-"""Render in another process: pyrender there, the simulator here, Cortex between them.
+"""Render in another process: pyrender runs there, the simulator here, and Cortex connects them.
 
-Put your own engine in place of `render`: it takes poses and returns frames. It prints how many pictures
-crossed, and whether the renderer conforms.
+Replace `render` by your own engine: it takes poses and returns frames. The example prints the number of
+pictures, and whether the renderer conforms.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def render_process(topic: str, ready: Any, done: Any) -> None:
 
 
 def main() -> tuple[int, list[str]]:
-    """Fly with frames of the other process; return how many came, and what does not conform."""
+    """Fly with frames of the other process; return the number of pictures and the defects found."""
     spawn = multiprocessing.get_context("spawn")
     ready, done = spawn.Event(), spawn.Event()
     process = spawn.Process(target=render_process, args=("/example/renderer", ready, done), daemon=True)

@@ -302,11 +302,9 @@ def test_settings_change_the_default_set_or_replace_it():
     assert loaded(**{"sinks.overview": None}) == {"recording": "hdf5", "rerun": "rerun"}
     with pytest.raises(ns.ConfigError, match=r"give `sinks`, which replace the default set, or `sinks\+`"):
         loaded({"sinks": mine, "sinks+": mine})
-    with pytest.raises(
-        ns.ConfigError, match=r"sinks: mine would write flight.h5, which is that of recording"
-    ):
+    with pytest.raises(ns.ConfigError, match=r"sinks: mine would write flight.h5, and so does recording"):
         loaded({"sinks+": {"mine": {"kind": "hdf5"}}})
-    with pytest.raises(ns.ConfigError, match=r"mine would write flight.h5, which is that of recording"):
+    with pytest.raises(ns.ConfigError, match=r"mine would write flight.h5, and so does recording"):
         loaded({"sinks+": {"mine": {"kind": "event_file", "name": "flight.h5"}}})
     with pytest.raises(ns.ConfigError, match=r"sinks.mine.name: config.yaml: no format of events has this"):
         loaded({"sinks": {"mine": {"kind": "event_file", "name": "config.yaml"}}})

@@ -6,6 +6,7 @@ import argparse
 import os
 import shlex
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -143,12 +144,16 @@ def _compare(arguments: argparse.Namespace) -> int:
     table = Table(box=None, pad_edge=False, header_style="dim")
     columns = ("file", "pixels", "events", "s", "M/s", "brighter", "interval", "silent", "cycles/px")
     for name in columns:
-        table.add_column(name, justify="left" if name == "file" else "right")
+        table.add_column(name, justify="left" if name == "file" else "right", overflow="fold")
     stats = []
+    files = find_recordings(arguments.files)
+    names = Counter(path.name for path in files)
     with console.status("reading") as status:
-        for path in find_recordings(arguments.files):
+        for path in files:
             status.update(f"reading {path}")
             one = measure_events(path, size=size, sensor=arguments.sensor)
+            if names[path.name] > 1:  # each flight has a flight.h5
+                one.name = str(path)
             stats.append(one)
             table.add_row(
                 one.name,

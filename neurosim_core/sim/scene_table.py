@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined,call-overload"
-"""The scenes that worlds are in: one for all, or several, which kernels find by index."""
+"""The scenes of worlds: one scene for all worlds, or several that kernels find by index."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from neurosim_core.sim.model import Model, find_device, make_model, refit
 _logger = logging.getLogger(__name__)
 
 SceneSource = str | Path | Mapping[str, Any]
-"""A settings file, of which the scene counts; a mesh file; or settings of a scene."""
+"""A settings file, whose scene is used; a mesh file; or settings of a scene."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,9 +31,9 @@ class SceneTable:
     """The scenes of all worlds, on the device."""
 
     models: tuple[Model, ...]
-    """One for each scene: its free space, the path in it, its light."""
+    """The model of each scene: free space, path and light."""
     scene_of_world: tuple[int, ...]
-    """Which scene a world is in."""
+    """Index of the scene of each world."""
     fields: wp.array[Any]
     """Distance to each scene, array of `DistanceField`, shape [scene]."""
     scene: wp.array[int]
@@ -41,7 +41,7 @@ class SceneTable:
     data: wp.array[Any] | None
     """`completed` on the device, array of `SceneData`; None: there is one row, or no camera."""
     row: wp.array[int]
-    """Which row of `data` the renderer reads in each world, shape [world]."""
+    """Row of `data` that the renderer reads in each world, shape [world]."""
     completed: tuple[SceneData, ...]
     """Arrays of each scene, or of each world, with all that a kernel for all scenes reads; empty: `data` is
     None."""
@@ -83,11 +83,11 @@ def make_scene_table(
     lenses_differ: bool = False,
     per_world_light: bool = False,
 ) -> SceneTable:
-    """Load the scenes of `count` worlds and bring them to the device; without any, that of the configuration.
+    """Load the scenes of `count` worlds, by default the configured one, and upload them.
 
-    `models` are scenes that were loaded before, each with its path and light. `scene_of_world` is the index
-    of each world's, shape [N]; by default they take turns. With `per_world_light` that of each world may be
-    changed.
+    `models` are loaded scenes, each with its path and light. `scene_of_world` is the index of
+    the scene of each world, shape [N]; by default 0, 1, ..., 0, 1, ... With `per_world_light`, the light of
+    each world can be changed.
 
     Raises:
         ValueError: A scene cannot be loaded, an index is out of range, the renderer is not `warp`, or bodies
@@ -95,11 +95,11 @@ def make_scene_table(
             or packed by other settings of the renderer than `config` says.
     """
     if config.renderer.kind != "warp":
-        raise ValueError(f"worlds are rendered by renderer 'warp', got {config.renderer.kind!r}")
+        raise ValueError(f"worlds need the renderer 'warp', got {config.renderer.kind!r}")
     if scenes is not None and models is not None:
         raise ValueError("give scenes or models, not both")
     if any(given is not None and len(given) == 0 for given in (scenes, models)):
-        raise ValueError("scenes or models must name one scene at least, got none")
+        raise ValueError("scenes or models must have at least one scene, got none")
     if len(scenes or models or ()) > 1 and config.bodies:
         raise ValueError(
             f"bodies move in one scene only, got {len(scenes or models or ())} scenes and "
@@ -109,7 +109,7 @@ def make_scene_table(
         _check_models(models, config)
     asked = isinstance(config.render.candidate_lists, CandidateListConfig)
     if asked and (lenses_differ or per_world_light or len(scenes or models or ()) > 1):
-        _logger.info("render.candidate_lists is left out: worlds differ in scenes, lenses or light")
+        _logger.info("render.candidate_lists is not used: worlds differ in scenes, lenses or light")
         alone = config.render.model_copy(update={"candidate_lists": None})  # Embree may do it on a CPU
         config = config.model_copy(update={"render": alone})
     if models is not None:
@@ -163,12 +163,12 @@ def _table(models: tuple[Model, ...], chosen: NDArray[Any], *, per_world_light: 
 
 
 def _check_models(models: Sequence[Model], config: SimulationConfig) -> None:
-    """Refuse models that hold something else than is asked for."""
+    """Raise if models do not match the configuration."""
     wanted = find_device(config.device)
     for index, model in enumerate(models):
         if model.device != wanted:
             raise ValueError(
-                f"models[{index}] is on {model.device}, and worlds are to be on {wanted}: make it there"
+                f"models[{index}] is on {model.device}, but the worlds are on {wanted}: make the model there"
             )
         if model.config.bodies != config.bodies:
             raise ValueError(

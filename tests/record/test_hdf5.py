@@ -455,7 +455,7 @@ def test_a_program_that_does_not_close_leaves_all_that_it_wrote(tmp_path, then, 
 
 
 def test_no_thread_is_left_of_a_recording_that_is_closed(tmp_path):
-    """One that the interpreter ends with may take a lock along for which the end waits, rarely."""
+    """A thread that is alive when the interpreter ends may hold a lock for which the interpreter waits."""
     before = threading.active_count()
     for _ in range(20):
         RecordingWriter(tmp_path / "f.h5", HEADER).close()

@@ -202,7 +202,7 @@ def test_walks_that_cannot_be_shared(several, plain, textured, caplog):
         )
         for walk in ({}, {"candidate_lists": {}})
     ]
-    assert caplog.text.count("render.candidate_lists is left out") == 1
+    assert caplog.text.count("render.candidate_lists is not used") == 1
     commands = commands_of("rates", 3, 2)
     plainly, walking = (record(worlds, commands) for worlds in made)
     assert event_count(plainly) > 100
@@ -531,10 +531,10 @@ def test_models_that_were_made_before(plain, textured):
         with pytest.raises(ValueError, match=message):
             Simulation(settings(plain, **changes), worlds=2, models=models[:1])
     elsewhere = dataclasses.replace(models[1], device="cuda:7")
-    with pytest.raises(ValueError, match=r"models\[1\] is on cuda:7, and worlds are to be on cpu"):
+    with pytest.raises(ValueError, match=r"models\[1\] is on cuda:7, but the worlds are on cpu"):
         Simulation(config, worlds=2, models=[models[0], elsewhere])
     for none in ({"models": ()}, {"scenes": ()}, {"scenes": []}):
-        with pytest.raises(ValueError, match="must name one scene at least"):
+        with pytest.raises(ValueError, match="must have at least one scene"):
             Simulation(config, worlds=2, **none)
 
 
