@@ -64,6 +64,35 @@ def start_warp() -> None:
     context.Module._compile = _compile_once(context.Module._compile)
 
 
+def find_device(name: str) -> str:
+    """Return the device that is meant.
+
+    Raises:
+        ValueError: It is not on this machine.
+        RuntimeError: This process was forked from one that had used a device.
+    """
+    start_warp()
+    known = [str(device) for device in wp.get_devices()]
+    if name == "auto":
+        return "cuda:0" if "cuda:0" in known else "cpu"
+    if name == "cuda":
+        name = "cuda:0"
+    if name not in known:
+        raise ValueError(
+            f"device {name!r} is not on this machine, known: {known}; cuda needs a GPU of NVIDIA and its "
+            "driver (`nvidia-smi` lists it), and device: auto takes what there is"
+        )
+    return name
+
+
+def begin_device(name: str) -> Any:
+    """Return a number on the device that is meant; where that is the first, a CUDA context begins.
+
+    That takes some 0.1 s, nearly all of it outside Python's interpreter lock.
+    """
+    return wp.zeros(1, device=find_device(name))
+
+
 def has_kernels() -> bool:
     """Return whether kernels of a simulator are in the kernel cache; a first flight compiles them all."""
     start_warp()  # which says where the cache is

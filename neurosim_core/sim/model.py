@@ -31,7 +31,7 @@ from neurosim_core.sim.schedule import Schedule
 from neurosim_core.trajectory import CollisionFreeConfig, Path, check_thrust, make_path
 from neurosim_core.trajectory.shapes import HoverConfig, hover
 from neurosim_core.vehicle import MultirotorConfig
-from neurosim_core.warp_start import start_warp
+from neurosim_core.warp_start import find_device
 
 _POSE_RATE_HZ = 500.0
 """Least rate at which poses are recorded for rays with times of their own [Hz]: where rotors answer
@@ -339,24 +339,3 @@ def _pose_clocks(config: SimulationConfig, groups: Sequence[RenderGroup]) -> tup
         return ()
     control_hz = config.control.rate_hz
     return (Rate(control_hz * math.ceil(_POSE_RATE_HZ / control_hz)),)
-
-
-def find_device(name: str) -> str:
-    """Return the device that is meant.
-
-    Raises:
-        ValueError: It is not on this machine.
-        RuntimeError: This process was forked from one that had used a device.
-    """
-    start_warp()
-    known = [str(device) for device in wp.get_devices()]
-    if name == "auto":
-        return "cuda:0" if "cuda:0" in known else "cpu"
-    if name == "cuda":
-        name = "cuda:0"
-    if name not in known:
-        raise ValueError(
-            f"device {name!r} is not on this machine, known: {known}; cuda needs a GPU of NVIDIA and its "
-            "driver (`nvidia-smi` lists it), and device: auto takes what there is"
-        )
-    return name
