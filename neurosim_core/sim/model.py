@@ -161,7 +161,7 @@ def _make_fleet(
         def plan_there() -> tuple[FreeSpace, dict[str, Path]]:
             if reader is None or reader.planner is None:
                 raise NotPlannedError
-            return _plan_there(members, reader.planner, mapping.result(), reading.result())
+            return _plan_there(members, reader.planner, reading.result(), mapping.result)
 
         def upload(scene: Scene) -> Any:
             beginning.result()
@@ -246,7 +246,10 @@ def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) 
 
 
 def _plan_there(
-    members: Mapping[str, SimulationConfig], planner: PlanningProcess, unseeded: FreeSpace, scene: Scene
+    members: Mapping[str, SimulationConfig],
+    planner: PlanningProcess,
+    scene: Scene,
+    mapped: Callable[[], FreeSpace],
 ) -> tuple[FreeSpace, dict[str, Path]]:
     """Have another process do what `_plan_here` does.
 
@@ -260,7 +263,7 @@ def _plan_there(
     for config in members.values():
         check_thrust(config.path, config.vehicle.airframe())
     room = next(iter(members.values())).free_space
-    free_space, paths = planner.plan(unseeded, room, flights, inside_m=scene.inside_m)
+    free_space, paths = planner.plan(scene, room, flights, mapped=mapped)
     return free_space, dict(zip(members, paths, strict=True))
 
 
