@@ -18,6 +18,7 @@ import warp as wp
 
 from neurosim_core.clock import Rate, to_ns
 from neurosim_core.config import SimulationConfig
+from neurosim_core.garbage import pause_collection
 from neurosim_core.path_process import NotPlannedError, PlanningProcess
 from neurosim_core.render.renderer import upload_scene
 from neurosim_core.runtime.timing import timed
@@ -126,10 +127,11 @@ def make_fleet(
 
     Arguments and errors as for `make_model`.
     """
-    if reader is not None:
-        with contextlib.suppress(NotReadError):
-            return _make_fleet(config, reader, on_phase, meanwhile)
-    return _make_fleet(config, None, on_phase, meanwhile)
+    with pause_collection():
+        if reader is not None:
+            with contextlib.suppress(NotReadError):
+                return _make_fleet(config, reader, on_phase, meanwhile)
+        return _make_fleet(config, None, on_phase, meanwhile)
 
 
 def _make_fleet(
