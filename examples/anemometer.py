@@ -1,4 +1,4 @@
-"""An anemometer in a gust: a sensor of your own that is one kernel, with errors. It prints what it read."""
+"""Fly your own sensor with one kernel and with errors: an anemometer in a gust. It prints the readings."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -12,13 +12,12 @@ import neurosim_core as ns
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Airflow(ns.Packet):
-    """What the anemometer reads."""
+    """A reading of the anemometer."""
 
     air: Annotated[NDArray[np.float64], ns.packets.FieldSpec(3, unit="m/s", frame="body")]
-    """Velocity of the air against the vehicle, in B [m/s]."""
+    """Velocity of the air relative to the vehicle, in B [m/s]."""
 
 
-# annotations must be objects: a file with such a function has no `from __future__ import annotations`
 @wp.func
 def _read_air(scale: wp.float64, motion: ns.sensors.Motion, world: int, output: int) -> wp.vec3d:
     against = motion.air_velocity[world] - motion.velocity[world]
@@ -33,7 +32,7 @@ class AnemometerConfig(ns.sensors.StateSensorConfig):
     rate_hz: ns.sensors.RateHz = 100.0
     """Readings a second [Hz]."""
     errors: ns.sensors.ErrorConfig = ns.sensors.ErrorConfig(white=0.05, markov=0.1)
-    """In m/s."""
+    """Errors of the velocity [m/s]."""
 
     scale: float = 1.0
     """Factor of all readings."""
@@ -41,7 +40,7 @@ class AnemometerConfig(ns.sensors.StateSensorConfig):
     packet_type = Airflow
 
     def make(self, context: ns.sensors.SamplerContext) -> ns.sensors.StateSampler:
-        """Return the sensor at work."""
+        """Return the sampler."""
         scale, errors = wp.float64(self.scale), {"air": self.errors}
         return ns.sensors.make_reader(context, _read_air, scale, errors, Airflow, rate_hz=self.rate_hz)
 

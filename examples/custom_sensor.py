@@ -1,6 +1,6 @@
-"""Fly a sensor of your own, from a file of your own: a switch that closes near the ground.
+"""Fly a sensor that this file defines: a switch that closes near the ground.
 
-It prints how often the switch was closed, and leaves a recording for `neurosim view proximity`. To install
+It prints how often the switch was closed, and writes a recording for `neurosim view proximity`. To install
 such a sensor as a package, name its module in an entry point of the group `neurosim.plugins`.
 """
 
@@ -19,7 +19,7 @@ import neurosim_core as ns
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Proximity(ns.Packet):
-    """What the switch reads: its recording, plot and messages follow from these fields."""
+    """A reading of the switch. These fields define its recording, its plot and its messages."""
 
     closed: bool
     height_m: Annotated[float, ns.packets.FieldSpec(unit="m")]
@@ -38,7 +38,7 @@ class ProximityConfig(ns.sensors.StateSensorConfig):
     packet_type = Proximity
 
     def make(self, context: ns.sensors.SamplerContext) -> ProximitySampler:
-        """Return the switch at work."""
+        """Return the sampler."""
         return ProximitySampler(self.threshold_m, context)
 
 

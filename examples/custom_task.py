@@ -1,4 +1,4 @@
-"""A task of one's own in one file: climb to a height above the start; prints how far off it ends.
+"""Train your own task in one file: climb to a height above the start. It prints the final error.
 
 python examples/custom_task.py            # a minute on a laptop; needs the extra `learn`
 """
@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import argparse
 
-import torch
-
 import neurosim_core as ns
+
+try:
+    import torch
+except ImportError as error:
+    raise SystemExit(f"this example needs PyTorch ({error}): pip install -e '.[learn]'") from None
 
 
 @ns.register("task", "climb")

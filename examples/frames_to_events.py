@@ -1,7 +1,7 @@
-"""Feed frames of your own to an event camera: an edge that moves to the right.
+"""Feed your own frames to an event camera: an edge that moves to the right.
 
-Each pixel that the edge passes sees its log radiance rise by log(4) = 1.39: 6 thresholds of 0.2, and a rest
-that is kept. So the number of events is known beforehand.
+The log radiance of each pixel that the edge passes rises by log(4) = 1.39: 6 thresholds of 0.2, and a
+remainder that the pixel keeps. So the number of events is known in advance.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Integrate an ideal IMU along a flight, and compare with the true velocity.
 
-An IMU measures specific force in its own axes: v' = R f + g. What is left after a second is the error of the
-trapezoidal rule at 1 kHz, and of rotors that change their thrust between two samples.
+An IMU measures specific force in its own axes: v' = R f + g. The remaining error after a second is that of
+the trapezoidal rule at 1 kHz, and of rotors that change their thrust between two samples.
 """
 
 from __future__ import annotations

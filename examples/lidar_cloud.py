@@ -1,6 +1,6 @@
 """Turn a LiDAR with 16 beams once around in a room, and measure the height above the floor in its cloud.
 
-Each ray has a time of its own, and `deskew` takes the motion out again.
+Each ray has its own time, and `deskew` removes the motion.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""Step eight worlds at once, each with another threshold of its event camera, and count events.
+"""Step eight worlds together, with different thresholds of their event cameras, and count events.
 
-Everything stays on the device: on a GPU the same lines step thousands. Few events come from high thresholds.
+Everything stays on the device: on a GPU, the same lines step thousands of worlds. High thresholds yield few
+events.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Give the pixels of an event camera a noise of your own: photons, of which there are fewer in the dark.
+"""Add your own noise term to the pixels of an event camera: photon noise, which is larger in the dark.
 
 It prints the events of a still grey wedge, by brightness. To install such a term as a package, name its
 module in an entry point of the group `neurosim.plugins`.
@@ -23,7 +23,7 @@ def add_photon_noise(
     since_reset_ns: wp.int64,
     log_radiance: wp.float64,
 ) -> wp.float64:
-    """Return log radiance with what the count of photons adds: a relative error of one over its root."""
+    """Return log radiance with photon noise: a relative error of one over the root of the photon count."""
     bits = ns.random.random_bits(seed, term.stream, since_reset_ns, pixel)
     photons = term.numbers[0] * wp.exp(log_radiance)
     return log_radiance + ns.random.normal2(bits)[0] / wp.sqrt(photons)

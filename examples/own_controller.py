@@ -1,6 +1,6 @@
-"""Fly with a controller of your own in the same process: climb by half a metre, and stay there.
+"""Fly with your own controller in the same process: climb by half a metre, and stay there.
 
-Between two control periods you have the exact state and all packets up to it.
+Between two control periods, the controller has the exact state and all packets up to it.
 """
 
 from __future__ import annotations

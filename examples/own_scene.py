@@ -1,7 +1,7 @@
 """Make a scene with trimesh, save it as GLB, and fly in it.
 
-Any glTF, OBJ, PLY or STL file in metres takes its place. The depth camera, 0.1 m in
-front of the middle of the vehicle, looks along x at a wall that is 4 m away.
+Any glTF, OBJ, PLY or STL file in metres works in the same way. The depth camera, 0.1 m in
+front of the centre of the vehicle, looks along x at a wall that is 4 m away.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Hand the packets of a flight to code of your own: poses in the format of TUM, beside the recording.
+"""Write the packets of a flight with your own sink: poses in the format of TUM, beside the recording.
 
-It prints how many were written; `path: {kind: poses, file: poses.txt, format: tum}` flies them again. To
+It prints the number of poses; `path: {kind: poses, file: poses.txt, format: tum}` flies them again. To
 install such a sink as a package, name its module in an entry point of the group `neurosim.plugins`.
 """
 
@@ -14,7 +14,7 @@ import neurosim_core as ns
 
 @ns.register("sink", "tum")
 class TumSinkConfig(ns.sinks.SinkConfig):
-    """Poses of the vehicle as text, a line for each: t x y z qx qy qz qw."""
+    """Writes poses of the vehicle as text, one per line: t x y z qx qy qz qw."""
 
     kind: Literal["tum"] = "tum"
     name: str = "poses.txt"

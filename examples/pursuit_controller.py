@@ -1,8 +1,8 @@
-"""Fly the path with a controller of your own, named in the settings: it asks for a velocity towards the path.
+"""Fly the path with your own controller, named in the settings: it commands a velocity towards the path.
 
-It prints how far from the path it is on average, beside the geometric controller. To install such a
+It prints its average distance from the path, and that of the geometric controller. To install such a
 controller as a package, name its module in an entry point of the group `neurosim.plugins`; `neurosim run`,
-`serve` and `fly` take it then.
+`serve` and `fly` then find it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Render in another process: pyrender there, the simulator here, Cortex between them.
+"""Render in another process: pyrender runs there, the simulator here, and Cortex connects them.
 
-Put your own engine in place of `render`: it takes poses and returns frames. It prints how many pictures
-crossed, and whether the renderer conforms.
+Replace `render` by your own engine: it takes poses and returns frames. The example prints the number of
+pictures, and whether the renderer conforms.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ LENS = ("width", "height", "fx", "fy", "cx", "cy")
 def render_process(topic: str, ready: Any, done: Any) -> None:
     """Run the other process: answer requests for frames with pyrender."""
     config = ns.load_config({"scene": SCENE})
-    scene = ns.upload_scene(config.scene.load(), config.render, device="cpu", renderer="pyrender")
+    try:
+        scene = ns.upload_scene(config.scene.load(), config.render, device="cpu", renderer="pyrender")
+    except RuntimeError as error:  # pyrender or OpenGL is missing
+        raise SystemExit(error) from None
     cameras: dict[ns.PinholeConfig, Any] = {}
 
     def render(request: Any) -> ns.Frames:
@@ -44,14 +47,15 @@ def render_process(topic: str, ready: Any, done: Any) -> None:
 
 
 def main() -> tuple[int, list[str]]:
-    """Fly with frames of the other process; return how many came, and what does not conform."""
+    """Fly with frames of the other process; return the number of pictures and the defects found."""
     spawn = multiprocessing.get_context("spawn")
     ready, done = spawn.Event(), spawn.Event()
     process = spawn.Process(target=render_process, args=("/example/renderer", ready, done), daemon=True)
     process.start()
     try:
         while not ready.wait(0.1):
-            assert process.is_alive(), "the other process has ended"
+            if not process.is_alive():
+                raise SystemExit("the process that renders has ended")
         lens = {"width": 160, "height": 120, "horizontal_fov_rad": 1.2}
         sensors = {kind: {"kind": kind, "rate_hz": 20, "lens": lens} for kind in ("rgb", "depth")}
         config = {"duration_s": 0.2, "device": "cpu", "scene": SCENE, "sensors": sensors}

@@ -1,6 +1,6 @@
-"""Fly another library's vehicle: the equations of RotorPy in place of ours, under the same sensors and path.
+"""Fly the vehicle of another library: RotorPy's equations with the same sensors and path.
 
-It prints how far the two vehicles get from each other in a second of the same flight. A vehicle of an
+It prints the largest distance between the two vehicles in a second of the same flight. A vehicle of an
 installed package registers through an entry point of the group `neurosim.plugins`.
 """
 
@@ -11,9 +11,13 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from rotorpy.vehicles.multirotor import Multirotor
 
 import neurosim_core as ns
+
+try:
+    from rotorpy.vehicles.multirotor import Multirotor
+except ImportError as error:
+    raise SystemExit(f"this example needs RotorPy ({error}): pip install -e '.[dev]'") from None
 
 _NAMES = dict(zip(ns.vehicle.MultirotorState._fields, ("x", "v", "q", "w", "rotor_speeds"), strict=True))
 
@@ -24,7 +28,7 @@ class RotorPyVehicleConfig(ns.vehicle.VehicleConfig):
 
     kind: Literal["rotorpy"] = "rotorpy"
     preset: str = "hummingbird"
-    """Name of the airframe: hummingbird, or crazyflie, whose parameters in RotorPy differ from ours."""
+    """Name of the airframe: hummingbird, or crazyflie, whose parameters differ in RotorPy and Neurosim."""
 
     def airframe(self) -> ns.MultirotorConfig:
         """Return the multirotor that controllers assume."""

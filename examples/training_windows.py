@@ -1,4 +1,4 @@
-"""Cut a flight into windows of events with their depth, as a network takes them.
+"""Cut a flight into windows of events with depth, as input of a network.
 
 The same lines read recordings, folders of recordings, event files, and running simulators.
 """

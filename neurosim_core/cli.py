@@ -206,7 +206,7 @@ def _add_call(commands: _Commands) -> None:
         "--position", type=float, nargs=3, metavar=("X", "Y", "Z"), help="start in the world [m]"
     )
     step = requests.add_parser("step", help="advance a paused run by some control periods")
-    step.add_argument("count", type=int, nargs="?", default=1)
+    step.add_argument("count", type=int, nargs="?", default=1, help="number of control periods (default: 1)")
     requests.add_parser("pause", help="pause simulated time")
     requests.add_parser("resume", help="resume simulated time")
     change = requests.add_parser("set", help="change settings of the run")
@@ -317,9 +317,9 @@ def _prepare(arguments: argparse.Namespace, module: str) -> Iterator[tuple[Simul
             Console(stderr=True).status("preparing: libraries"),  # on the screen before they are there
             ThreadPoolExecutor(max_workers=1) as aside,
         ):
-            from neurosim_core.warp_start import begin_device
+            from neurosim_core.warp_start import start_device
 
-            aside.submit(begin_device, settings.get("device", "auto"))  # what is wrong is said later
+            aside.submit(start_device, settings.get("device", "auto"))  # `make_model` reports errors
             config = load_settings(arguments)
             importlib.import_module(module)
         yield config, reader

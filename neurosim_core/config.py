@@ -218,7 +218,9 @@ class SimulationConfig(BaseConfig):
                     known = ", ".join(dict.fromkeys([*sensors, *STREAMS]))
                     raise ValueError(f"links.{link}: vehicle {name!r} has no such link, known: {known}")
                 if link == "command" and (settings.clock_offset_s or settings.clock_drift_ppm):
-                    raise ValueError("links.command: a command has no clock of its own to be set off")
+                    raise ValueError(
+                        "links.command: clock_offset_s and clock_drift_ppm are for links of sensors"
+                    )
         return self
 
     def of(self, name: str) -> SimulationConfig:
@@ -272,7 +274,10 @@ def load_config(
     Raises:
         ConfigError: The file cannot be read or is not YAML; a key is unknown; a value is of the wrong type or
             out of range. The message has one line for each error.
+        TypeError: The source is neither the name of a file nor settings.
     """
+    if not isinstance(source, str | Path | Mapping | SimulationConfig | None):
+        raise TypeError(f"settings are the name of a YAML file, a mapping or None, got {source!r}")
     origin = str(source) if isinstance(source, str | Path) else "config"
     raw = read_file(Path(source)) if isinstance(source, str | Path) else dict(source or {})
     patches = [nest(key, value) for key, value in (overrides or {}).items()]

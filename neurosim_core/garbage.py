@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def pause_collection() -> Iterator[None]:
-    """Look for no garbage in a block: among what a set-up makes, which stays, that takes 0.1 s each time."""
+    """Disable garbage collection in a block: during a set-up a collection takes 0.1 s and finds nothing."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -21,7 +21,7 @@ def pause_collection() -> Iterator[None]:
 
 @contextlib.contextmanager
 def no_collection() -> Iterator[None]:
-    """Look for no garbage in a block, nor ever in what is there at its end: once in a process."""
+    """Disable garbage collection in a block, and exclude all objects at its end; use it once in a process."""
     with pause_collection():
         try:
             yield

@@ -56,9 +56,9 @@ def lazy_names(
         is_new = module not in sys.modules
         with pause_collection():
             found = importlib.import_module(module)
-            if is_new and gc.get_freeze_count() == 0:  # else the program decides what is looked at
+            if is_new and gc.get_freeze_count() == 0:  # else the program has frozen objects of its own
                 gc.freeze()
-                gc.unfreeze()  # all that imports have made is old now, and is not looked through as new
+                gc.unfreeze()  # moves all objects to the oldest generation, unseen
         return getattr(found, attribute) if attribute else found
 
     return find, lambda: names, names

@@ -21,6 +21,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "config", nargs="?", type=Path, help="settings file (YAML); default: a generated apartment"
     )
+    parser.add_argument("--scene", type=Path, metavar="FILE", help="mesh file to fly in (.glb, .obj, ...)")
     parser.add_argument("--duration", type=float, metavar="S", help="simulated time [s]")
     parser.add_argument("--seed", type=int, help="seed of the sensor noise; data sets: of the first flight")
     parser.add_argument("--device", help="device to compute on: auto, cpu, cuda:0, ...")
@@ -33,12 +34,17 @@ def load_settings(arguments: argparse.Namespace) -> SimulationConfig:
 
     options = set_options(read_settings(arguments.settings))
     options |= {key: f"--{name}" for key, name in _given(arguments).items()}
+    if arguments.scene is not None:
+        options["scene"] = "--scene"
     return load_config(arguments.config, overrides=settings_of(arguments), options=options)
 
 
 def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return what wins over the settings file, by dotted key."""
-    settings = read_settings(arguments.settings)
+    settings: dict[str, Any] = {}
+    if arguments.scene is not None:
+        settings["scene"] = {"kind": "mesh", "file": str(arguments.scene.resolve())}
+    settings |= read_settings(arguments.settings)
     settings |= {key: getattr(arguments, name) for key, name in _given(arguments).items()}
     if hasattr(arguments, "lockstep"):  # a live run
         if arguments.lockstep and arguments.factor is not None:

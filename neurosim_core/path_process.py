@@ -45,10 +45,10 @@ class PlanningProcess:
         """Return what `choose_seed` does, and the path that `make_path` plans there for each flight.
 
         Args:
-            scene: Where to fly; its triangles are enough.
+            scene: The scene to fly in; materials are not needed.
             config: See `choose_seed`.
             flights: Configuration of each path, and how long it is flown at least [s].
-            mapped: Waits for the map of the scene, while the process builds a tree of the triangles.
+            mapped: Waits for the distance map; meanwhile the process builds the tree of the triangles.
 
         Raises:
             NotPlannedError: The process has ended, because there is no such path or for any other reason.

@@ -1,12 +1,12 @@
-"""The registry of plug-ins: a table kind -> class for each category; others are added by entry points.
+"""The registry: a table kind -> class for each category, which plug-ins extend through entry points.
 
-A package adds its own sensors, vehicles, ... by registering classes in a module that an entry point of the
-group `neurosim.plugins` names; the module is imported when a kind is asked for that is not of Neurosim:
+A package registers its sensors, vehicles, ... in a module, and names that module in an entry point of the
+group `neurosim.plugins`. The registry imports the module when settings use a kind that is not built in:
 
     [project.entry-points."neurosim.plugins"]
     my_sensors = "my_package.sensors"
 
-In a script, importing or defining the class before the settings are loaded is enough.
+A script only has to import or define the class before it loads the settings.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from types import MappingProxyType
 from typing import TypeVar
 
 ENTRY_POINT_GROUP = "neurosim.plugins"
-"""Entry points whose modules register what they bring."""
+"""Group of entry points that name modules of plug-ins."""
 
 CATEGORIES = ("sensor", "vehicle", "controller", "renderer", "scene", "sink", "noise", "task")
-"""What can be registered."""
+"""Categories of classes that can be registered."""
 
-_OWN = {
+_BUILT_IN = {
     "vehicle": {"multirotor": "vehicle.multirotor"},
     "controller": {"se3": "control.base"},
     "scene": {"apartment": "scene.apartment", "hall": "scene.hall", "mesh": "scene.mesh"},
@@ -39,7 +39,7 @@ _OWN = {
     "noise": {"leak": "sensors.event_config"},
     "task": {"hover": "learn.tasks"},
 }
-"""Modules by one of the kinds that they register; those of sensors are named for their kind."""
+"""Modules of built-in kinds, by one kind of each module. Modules of sensors are named for their kind."""
 
 Registered = TypeVar("Registered", bound=type)
 
@@ -53,17 +53,17 @@ def register(category: str, kind: str) -> Callable[[Registered], Registered]:
 
     Args:
         category: One of `CATEGORIES`.
-        kind: The name under which settings ask for the class, such as "depth".
+        kind: Name of the class in settings, such as "depth".
 
     Raises:
-        TypeError: The class lacks what every class of the category has.
-        ValueError: No such category, the kind is of another class, or the class says that it has another.
+        TypeError: The class lacks a member that its category requires.
+        ValueError: There is no such category, the kind is taken, or the field `kind` of the class differs.
     """
     table = _table(category)
 
     def add(cls: Registered) -> Registered:
         if not cls.__module__.startswith("neurosim_core."):
-            _import_own(category)  # a kind of our own is taken, whoever comes first
+            _import_built_in(category)  # built-in kinds are taken, even if they are not imported yet
             load_plugins()
         known = table.get(kind)
         if known is not None and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
@@ -74,7 +74,7 @@ def register(category: str, kind: str) -> Callable[[Registered], Registered]:
         own = getattr(cls, "model_fields", {}).get("kind")
         if own is not None and own.default != kind:
             raise ValueError(
-                f"{cls.__qualname__} is registered as {category} kind {kind!r}, and its field `kind` says "
+                f"{cls.__qualname__} is registered as {category} kind {kind!r}, but its field `kind` is "
                 f"{own.default!r}: give both the same name"
             )
         check: Callable[[], None] | None = getattr(cls, "check_class", None)
@@ -87,19 +87,19 @@ def register(category: str, kind: str) -> Callable[[Registered], Registered]:
 
 
 def kinds(category: str) -> Mapping[str, type]:
-    """Return the classes of a category by kind, those of installed plug-ins included.
+    """Return the classes of a category by kind, including those of installed plug-ins.
 
     Raises:
         ValueError: There is no such category.
     """
     table = registered(category)
-    _import_own(category)
+    _import_built_in(category)
     load_plugins()
     return table
 
 
 def registered(category: str) -> Mapping[str, type]:
-    """Return the classes of a category by kind that have been imported until now.
+    """Return the classes of a category by kind that are imported so far.
 
     Raises:
         ValueError: There is no such category.
@@ -111,13 +111,13 @@ def find(category: str, kind: str) -> type:
     """Return the class of a kind.
 
     Raises:
-        ValueError: There is no such category or kind; the message has those that are known.
+        ValueError: There is no such category or kind; the message lists the known ones.
     """
     table = _table(category)
-    if kind not in table and kind in (own := _own_modules(category)):
-        importlib.import_module(own[kind])
+    if kind not in table and kind in (modules := _built_in_modules(category)):
+        importlib.import_module(modules[kind])
     if kind not in table:
-        _import_own(category)
+        _import_built_in(category)
         load_plugins()
     if kind not in table:
         raise ValueError(f"unknown {category} kind {kind!r}, known: {sorted(table)}")
@@ -125,26 +125,25 @@ def find(category: str, kind: str) -> type:
 
 
 def load_plugins() -> None:
-    """Import every module of ours that registers a kind, and those that entry points name, once in a process.
+    """Import all modules that register kinds, built-in ones and those of entry points, once in a process.
 
-    Tasks are left out: they need PyTorch. A foreign module that cannot be imported is left out with a
-    warning: one broken package must not take the others down. What it has registered before it failed is
-    forgotten.
+    Built-in tasks are not imported, because they need PyTorch. A plug-in that fails to import is skipped with
+    a warning, so that one broken package does not affect others; its registrations are undone.
     """
     global _loaded
     if _loaded:
         return
     _loaded = True
-    from importlib.metadata import entry_points  # which is slow to import, and few runs need
+    from importlib.metadata import entry_points  # slow to import, and most runs do not need it
 
     for category in CATEGORIES:
         if category != "task":
-            _import_own(category)
+            _import_built_in(category)
     for entry in entry_points(group=ENTRY_POINT_GROUP):
         before = {category: dict(table) for category, table in _tables.items()}
         try:
             entry.load()
-        except Exception as error:  # whatever a foreign module raises when it is imported
+        except Exception as error:  # a plug-in may raise anything when it is imported
             for category, table in _tables.items():
                 broken = [
                     kind
@@ -156,18 +155,18 @@ def load_plugins() -> None:
             _logger.warning("the plug-in %s (%s) cannot be loaded: %s", entry.name, entry.value, error)
 
 
-def _import_own(category: str) -> None:
-    for module in _own_modules(category).values():
+def _import_built_in(category: str) -> None:
+    for module in _built_in_modules(category).values():
         importlib.import_module(module)
 
 
-def _own_modules(category: str) -> dict[str, str]:
-    """Return the modules of our own kinds of a category; of sensors all, some of which have none."""
+def _built_in_modules(category: str) -> dict[str, str]:
+    """Return the modules of built-in kinds; for sensors all modules, some of which register none."""
     if category == "sensor":
         sensors = importlib.import_module("neurosim_core.sensors")
         names = (module.name for module in pkgutil.iter_modules(sensors.__path__))
         return {name: f"{sensors.__name__}.{name}" for name in names}
-    return {kind: f"neurosim_core.{module}" for kind, module in _OWN.get(category, {}).items()}
+    return {kind: f"neurosim_core.{module}" for kind, module in _BUILT_IN.get(category, {}).items()}
 
 
 def _table(category: str) -> dict[str, type]:

@@ -26,14 +26,15 @@ def read_file(path: Path) -> dict[str, Any]:
         raw = yaml.safe_load(path.read_text(encoding="utf-8"))
     except UnicodeDecodeError:
         raise ConfigError(
-            f"{path} is binary, no settings; a mesh is named in them: scene: {{kind: mesh, file: {path}}}"
+            f"{path} is binary, no settings; a mesh is given by --scene {path}, or in settings: "
+            f"scene: {{kind: mesh, file: {path}}}"
         ) from None
     except FileNotFoundError:
         if path.suffix.lower() not in ("", ".yaml", ".yml"):
             raise ConfigError(
                 f"{path}: no such file; settings are YAML, in which a mesh is "
                 f"scene: {{kind: mesh, file: {path.name}}}, "
-                f"or say --set scene.kind=mesh --set scene.file={path}"
+                f"or say --scene {path}"
             ) from None
         raise ConfigError(
             f"no settings file {path}: `neurosim run --print-config > {path}` makes one"

@@ -60,71 +60,73 @@ class SinkContext:
     name: str
     """The sink's name in the settings."""
     folder: Path
-    """Of the flight; it exists."""
+    """Folder of the flight; it exists."""
     stem: str
-    """Prefix of the files of the flight: flight; after a reset of a live run flight-2, ..."""
+    """Prefix of the file names: flight; after a reset of a live run flight-2, ..."""
     model: Model
     """The model of the flight."""
     header: RecordingHeader
-    """Settings, sensors and path, as a recording has them."""
+    """Header of a recording: settings, sensors and path."""
+    begin_s: float = field(default_factory=time.perf_counter)
+    """When the flight began, as `time.perf_counter` says [s]: its real-time factor counts from there."""
     on_stop: list[Callable[[], object]] = field(default_factory=list)
-    """Called when the flight is asked to end, by a signal handler: a sink that waits for others adds how
-    it stops waiting."""
+    """Functions that a signal handler calls to end the flight. A sink that waits for other processes adds a
+    function that ends the wait."""
 
 
 class SinkConfig(BaseConfig):
-    """Settings that all sinks have. A kind adds its `kind`, what it needs, and `open`."""
+    """Base class of the settings of sinks. Subclasses add `kind`, their fields, and `open`."""
 
     kind: str
-    """Under which name the class is registered."""
+    """Name under which the class is registered."""
 
     library: ClassVar[tuple[str, str] | None] = None
-    """A library that it needs, and the extra that brings it: where that is missing, the sink is left out."""
+    """A required library and the extra that installs it; without the library, the sink is skipped."""
     is_live: ClassVar[bool] = True
-    """Whether it takes part in the recording of a live run (`neurosim serve --record`)."""
+    """Whether `neurosim serve --record` uses it."""
     is_optional: ClassVar[bool] = False
-    """Whether the flight goes on without it, when it or the disk cannot be written any more."""
+    """Whether the flight continues without it after a write error, such as a full disk."""
     again: ClassVar[str] = ""
-    """What makes it again from flight.h5, where it was given up; {folder} is that of the flight."""
+    """Hint how to make its file from flight.h5 after an error; {folder} is the folder of the flight."""
 
     def is_installed(self) -> bool:
-        """Whether the library that it needs is there."""
+        """Whether the required library is installed."""
         return self.library is None or importlib.util.find_spec(self.library[0]) is not None
 
     def file(self, stem: str) -> str:
-        """Return the name of its file; empty: it has none."""
+        """Return the name of its file; empty: no file."""
         return ""
 
     def prepare(self) -> None:
-        """Start a process that it needs, before other work."""
+        """Start processes early, before other set-up work."""
 
     def load(self) -> None:
-        """Import what it needs, beside other work."""
+        """Import libraries, in a thread beside other set-up work."""
 
     def check(self, name: str, sensors: Mapping[str, SensorConfig]) -> None:
-        """Refuse what `open` would refuse of a flight with these sensors; before anything else is done.
+        """Check early that `open` can handle a flight with these sensors.
 
         Args:
             name: The sink's name in the settings.
-            sensors: Of the flight, by name.
+            sensors: Sensors of the flight, by name.
 
         Raises:
-            ValueError: It lacks a sensor.
-            ImportError: A library that it cannot do without is not installed.
+            ValueError: A sensor that it needs is missing.
+            ImportError: A library that it needs is not installed.
         """
 
     def open(self, context: SinkContext) -> Sink:
         """Return the sink of one flight.
 
         Raises:
-            OSError: It cannot be written.
+            OSError: Its output cannot be written.
         """
         raise NotImplementedError
 
 
 @register("sink", "hdf5")
 class Hdf5SinkConfig(SinkConfig):
-    """The recording, flight.h5: all packets of all sensors. A process of its own writes it."""
+    """The recording, flight.h5: all packets of all sensors, written by a separate process."""
 
     kind: Literal["hdf5"] = "hdf5"
     library = ("h5py", "record")
@@ -134,14 +136,14 @@ class Hdf5SinkConfig(SinkConfig):
         return f"{stem}.h5"
 
     def prepare(self) -> None:
-        """Start the process that writes."""
+        """Start the writing process."""
         from neurosim_core.record.process import start_process
 
         if self.is_installed():
             start_process()
 
     def open(self, context: SinkContext) -> Sink:
-        """Return what hands packets to that process."""
+        """Return the sink that sends packets to the writing process."""
         from neurosim_core.record.process import RecordingProcess
 
         return RecordingProcess(context.folder / self.file(context.stem), context.header)
@@ -149,7 +151,7 @@ class Hdf5SinkConfig(SinkConfig):
 
 @register("sink", "rerun")
 class RerunSinkConfig(SinkConfig):
-    """A file of the Rerun viewer, flight.rrd; can be made again from the recording."""
+    """A file of the Rerun viewer, flight.rrd; `neurosim view` can also make it from the recording."""
 
     kind: Literal["rerun"] = "rerun"
     library = ("rerun", "view")
@@ -168,7 +170,7 @@ class RerunSinkConfig(SinkConfig):
         import_rerun()
 
     def open(self, context: SinkContext) -> Sink:
-        """Return what writes it."""
+        """Return the writer."""
         from neurosim_core.view.sinks import RerunSink
 
         return RerunSink(context.folder / self.file(context.stem), context)
@@ -188,28 +190,28 @@ class OverviewSinkConfig(SinkConfig):
         return "overview.png"
 
     def open(self, context: SinkContext) -> Sink:
-        """Return what draws it."""
+        """Return the sink that draws it."""
         from neurosim_core.view.sinks import OverviewSink
 
         return OverviewSink(context.folder / self.file(context.stem), context)
 
 
 def default_sinks() -> dict[str, SinkConfig]:
-    """Return what a flight leaves unless its settings say otherwise."""
+    """Return the default sinks."""
     return {"recording": Hdf5SinkConfig(), "rerun": RerunSinkConfig(), "overview": OverviewSinkConfig()}
 
 
 def check_files(sinks: Mapping[str, SinkConfig]) -> Mapping[str, SinkConfig]:
-    """Return sinks of which no two write the same file.
+    """Return the sinks if no two of them write the same file.
 
     Raises:
-        ValueError: Two do.
+        ValueError: Two sinks write the same file.
     """
     writers: dict[str, str] = {}
     for name, sink in sinks.items():
         file = sink.file("flight")
         if file and writers.setdefault(file, name) is not name:
-            raise ValueError(f"{name} would write {file}, which is that of {writers[file]}")
+            raise ValueError(f"{name} would write {file}, and so does {writers[file]}: give one another name")
     return sinks
 
 
@@ -296,7 +298,8 @@ class Sinks:
         Args:
             settings: By name.
             say: Told what is left out or given up.
-            context: `folder`, `stem`, `model`, `header` and, where there is one, `on_stop` of `SinkContext`.
+            context: `folder`, `stem`, `model`, `header` and, where there are any, `begin_s` and `on_stop` of
+                `SinkContext`.
 
         Raises:
             OSError, ValueError: One cannot be opened.

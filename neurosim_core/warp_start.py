@@ -65,10 +65,10 @@ def start_warp() -> None:
 
 
 def find_device(name: str) -> str:
-    """Return the device that is meant.
+    """Return the Warp name of a device setting: auto, cuda, cpu, cuda:0, ...
 
     Raises:
-        ValueError: It is not on this machine.
+        ValueError: The device is not on this machine.
         RuntimeError: This process was forked from one that had used a device.
     """
     start_warp()
@@ -79,16 +79,16 @@ def find_device(name: str) -> str:
         name = "cuda:0"
     if name not in known:
         raise ValueError(
-            f"device {name!r} is not on this machine, known: {known}; cuda needs a GPU of NVIDIA and its "
-            "driver (`nvidia-smi` lists it), and device: auto takes what there is"
+            f"device {name!r} is not on this machine, known: {known}; cuda needs an NVIDIA GPU and its "
+            "driver (`nvidia-smi` lists it), and device: auto takes a GPU if there is one, else the CPU"
         )
     return name
 
 
-def begin_device(name: str) -> Any:
-    """Return a number on the device that is meant; where that is the first, a CUDA context begins.
+def start_device(name: str) -> Any:
+    """Allocate a number on the device of a setting, see `find_device`: the first one creates a CUDA context.
 
-    That takes some 0.1 s, nearly all of it outside Python's interpreter lock.
+    Most of that runs in the driver, without the GIL.
     """
     return wp.zeros(1, device=find_device(name))
 

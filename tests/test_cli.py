@@ -151,7 +151,7 @@ def test_an_animation_of_events_alone_is_refused_and_says_what_can_be_made(flown
     assert cli.main(["view", str(file), "--save", str(tmp_path / "film.webp")]) == 1
     told = capsys.readouterr().err
     assert f"an animation needs pictures in colour, and {file} has none" in told
-    assert f"save what there is for Rerun, as {tmp_path / 'film.rrd'}" in told
+    assert f"save a file for Rerun, as {tmp_path / 'film.rrd'}" in told
     assert cli.main(["view", str(tmp_path / "nosuch"), "--save", str(tmp_path / "film.webp")]) == 1
     assert f"`neurosim run --out {tmp_path / 'nosuch'}` makes one" in capsys.readouterr().err
 
@@ -480,6 +480,20 @@ def test_errors_of_set_are_said_of_it(settings, said, capsys):
     assert cli.main(["run", *options]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"neurosim: {said}")
+
+
+def test_a_scene_is_given_by_its_file(tmp_path, capsys):
+    """It replaces the scene of the settings file; its own settings may follow."""
+    file = tmp_path / "settings.yaml"
+    file.write_text("scene: {kind: apartment, rooms: 2}")
+    room = tmp_path / "room.glb"
+    trimesh.creation.box((4.0, 4.0, 3.0)).export(room)
+    scene = ["--scene", str(room)]
+    assert cli.main(["run", str(file), *scene, "--set", "scene.unit_m=2.0", "--print-config"]) == 0
+    chosen = yaml.safe_load(capsys.readouterr().out)["scene"]
+    assert (chosen["kind"], chosen["file"], chosen["unit_m"]) == ("mesh", str(room), 2.0)
+    assert cli.main(["run", str(file), "--scene", "none.glb"]) == 1
+    assert "none.glb: no such file" in capsys.readouterr().err
 
 
 def test_options_are_not_abbreviated(capsys):

@@ -33,7 +33,7 @@ MISTAKES = {
     "run --set scene=house.glb": "the file of a scene is scene: {kind: mesh, file: house.glb}",
     "run --set duration_s=4s": "--set duration_s: Input should be a valid number, got '4s'",
     "run --set sensors.events.lens.horizontal_fov_rad=90": "if these are degrees, write 1.5708",
-    "run --device cuda:7": "device: auto takes what there is",
+    "run --device cuda:7": "device: auto takes a GPU if there is one",
     "run film.mp4": "must hold a mapping",
     "scene house.glb": "house.glb: no such file",
     "scene bad.glb --out mm": "mm: the scene is drawn into a picture: mm.png",
@@ -72,6 +72,12 @@ def test_mistakes_in_python_are_answered_as_well():
         _ = ns.load_confg
     with pytest.raises(ns.ConfigError, match="duration: unknown key; did you mean 'duration_s'"):
         next(iter(ns.run({"duration": 1.0})))
+    with pytest.raises(
+        ns.ConfigError, match=r"EventCameraConfig .*:\n  threshold_on: .* greater .*, got -1\Z"
+    ):
+        ns.EventCameraConfig(threshold_on=-1)
+    with pytest.raises(TypeError, match="the name of a YAML file, a mapping or None, got 3"):
+        ns.load_config(3)
     with pytest.raises(ValueError, match=r"unknown airframe 'humingbird', known: .*'hummingbird'"):
         ns.preset("humingbird")
     with pytest.raises(FileNotFoundError, match=r"no file nothing\.h5"):

@@ -55,3 +55,22 @@ def test_a_foreign_cortex_is_refused_in_words(tmp_path):
     assert done.returncode == 1
     assert f"ImportError: `import cortex` finds {foreign}" in done.stderr
     assert "pip uninstall cortex" in done.stderr
+
+
+def test_a_bridge_without_its_libraries_says_what_to_install():
+    """What a user has who installed the simulator alone."""
+    code = (
+        "import importlib.abc, sys\n"
+        "class Absent(importlib.abc.MetaPathFinder):\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'rosbags': raise ModuleNotFoundError(name, name=name)\n"
+        "sys.meta_path.insert(0, Absent())\n"
+        "from cortex_ros2_bridge.__main__ import main\n"
+        "sys.exit(main())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, "--list"], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert done.stderr == (
+        "cortex-ros2-bridge: the bridge needs rosbags, which is not installed: "
+        "pip install -e '.[ros2]' in the folder of Neurosim\n"
+    )

@@ -61,18 +61,18 @@ _DELAY = ("delays", "tours", "mode", "seconds", "settings")
 
 QUESTIONS: Sequence[Question] = (
     Question("dynamics", "error against run time of the flight dynamics, and stiff and extreme flights"),
-    Question("replay", "logs of real flights of a Crazyflie against the vehicle model", ("logs",), False),
+    Question("replay", "recorded flights of a Crazyflie compared with the vehicle model", ("logs",), False),
     Question("events", "error against run time, over renders a second and rays", (*_VIEW, "samples")),
     Question("pixel", "a test bench of the event pixel: ramp, step, sine, noise of the presets", ("device",)),
     Question("render", "error against run time of rendering", ("scene", "device", "samples")),
-    Question("throughput", "whole steps a second, and what their parts take", ("scene", "device", "samples")),
+    Question("throughput", "whole steps a second, and the time of each part", ("scene", "device", "samples")),
     Question("worlds", "renders a second of many worlds stepped together", (*_VIEW, "worlds", "seconds")),
     Question("data", "windows a second from a recording, for learning"),
-    Question("leave-out", "work that a scene does not need is left out: kernels, memory, libraries, time"),
+    Question("leave-out", "kernels, memory, libraries and time that unused terms save"),
     Question("step", "whole steps a second with one event camera", (*_VIEW, *_STEPS), False),
     Question("closed-loop", "latency from command to image between processes", (*_VIEW, *_LOOP), False),
     Question("streaming", "an IMU beside an event camera in real time", (*_VIEW, *_STREAM), False),
-    Question("delay", "a slow controller against the same delay in lockstep", _DELAY, False),
+    Question("delay", "a slow controller compared with the same delay simulated in lockstep", _DELAY, False),
 )
 """All questions; `bench all` asks in this order."""
 
@@ -85,7 +85,7 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         _add(names.add_parser(question.name, help=question.help, description=question.help), [question])
     asked = [question for question in QUESTIONS if question.in_all]
     text = f"{', '.join(question.name for question in asked)} in one report"
-    more = "; a chapter that fails says so, the others are measured, and the exit status is 1"
+    more = "; if a chapter fails, the others still run, and the exit status is 1"
     _add(names.add_parser("all", help=text, description=text + more), asked, folder="report")
 
 

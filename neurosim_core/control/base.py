@@ -21,27 +21,27 @@ from neurosim_core.vehicle.arrays import MultirotorState
 
 
 class PathController(Protocol):
-    """A controller, which flies the vehicles of all worlds along their paths."""
+    """A controller that flies the vehicles of all worlds along their paths."""
 
     def update(self, arrays: Any) -> None:
         """Write `arrays.rotor_speed_command` from the state in `arrays`, at each control period.
 
-        On a CUDA device it only launches, and is captured in a graph.
+        On a CUDA device it must only launch kernels and copies, because it is captured in a graph.
 
         Args:
-            arrays: Of the vehicles (`MultirotorArrays`), on the device.
+            arrays: Arrays of the vehicles (`MultirotorArrays`), on the device.
         """
 
     def begin(self, mask: Any) -> None:
-        """Forget what was before, where the mask, device array of int32, shape [N], is not 0."""
+        """Reset the memory of worlds whose mask is not 0, device array of int32, shape [N]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ControllerContext:
-    """The context that a controller is made in."""
+    """Arguments of `ControllerConfig.make`."""
 
     airframe: MultirotorConfig
-    """The multirotor that the vehicles are assumed to be."""
+    """The multirotor that controllers assume."""
     paths: Sequence[Path]
     """The path of each world, shape [N]."""
     device: Any
@@ -49,10 +49,10 @@ class ControllerContext:
 
 
 class ControllerConfig(BaseConfig):
-    """Settings that all controllers have. A kind adds its `kind`, what it needs, and `make`."""
+    """Base class of the settings of controllers. Subclasses add `kind`, their fields, and `make`."""
 
     kind: str
-    """Under which name the class is registered."""
+    """Name under which the class is registered."""
     rate_hz: Annotated[float, Field(gt=0.0, le=10_000.0)] = 200.0
     """Command rate [Hz]; each command is held until the next."""
     gains: Se3Config = Se3Config()
@@ -83,33 +83,33 @@ class Se3ControllerConfig(ControllerConfig):
 
 
 class HostController:
-    """Base of a controller that is computed in Python: define `command`, and `forget` if it remembers.
+    """Base class of controllers in plain Python. Define `command`, and `forget` if it has memory.
 
-    It flies on the CPU, one world after the other.
+    It runs on the CPU, one world after the other.
     """
 
     def __init__(self, context: ControllerContext, gains: Se3Config | None = None) -> None:
         """Prepare the paths.
 
         Args:
-            context: What it is made for.
-            gains: With which its setpoints become rotor speeds.
+            context: Context of `ControllerConfig.make`.
+            gains: Gains of the conversion from setpoints to rotor speeds.
 
         Raises:
             ValueError: The device is not the CPU.
         """
         if wp.get_device(context.device).is_cuda:
-            raise ValueError(f"{type(self).__name__} is computed in Python: it needs device: cpu")
+            raise ValueError(f"{type(self).__name__} runs in Python: it needs device: cpu")
         self.airframe, self._gains = context.airframe, gains
         self._cursors = [PathCursor(path) for path in context.paths]
         self._lower: Controller | None = None
 
     def command(self, state: MultirotorState, target: np.void, *, stamp_ns: int, world: int) -> Setpoint:
-        """Return what one vehicle is to do until the next control period, always in one mode.
+        """Return the setpoint of one vehicle for a control period; the mode must always be the same.
 
         Args:
-            state: Of the vehicle, without a leading axis.
-            target: Where the path is at the stamp: a record with the fields of `PathPoint`, such as
+            state: State of the vehicle, without a leading axis.
+            target: The path at the stamp: a record with the fields of `PathPoint`, such as
                 `position`, `velocity`, `acceleration` and `yaw`; valid until the next call.
             stamp_ns: Time since the start of the episode [ns].
             world: Index of the world.
@@ -117,18 +117,18 @@ class HostController:
         raise NotImplementedError
 
     def forget(self, world: int) -> None:
-        """Begin a new episode in a world."""
+        """Reset the memory of one world, at the begin of an episode."""
 
     def begin(self, mask: Any) -> None:
-        """Begin a new episode in all worlds of which the mask is not 0."""
+        """Reset the memory of worlds whose mask is not 0."""
         for world in np.flatnonzero(mask.numpy()).tolist():
             self.forget(world)
 
     def update(self, arrays: Any) -> None:
-        """Write the rotor speeds that are commanded to the vehicles of all worlds.
+        """Write the rotor speed commands of the vehicles of all worlds.
 
         Raises:
-            ValueError: A setpoint is not finite, or of another mode than the first.
+            ValueError: A setpoint is not finite, or its mode differs from that of the first.
             TypeError: `command` returns no setpoint.
         """
         stamps_ns = arrays.stamp_ns.numpy()
@@ -144,7 +144,7 @@ class HostController:
                 self._lower = Controller(setpoint.mode, self.airframe, self._gains, count=len(self._cursors))
             if setpoint.mode != self._lower.mode:
                 raise ValueError(
-                    f"{type(self).__name__} commands {self._lower.mode}: it cannot go over to {setpoint.mode}"
+                    f"{type(self).__name__} commands {self._lower.mode}: it cannot change to {setpoint.mode}"
                 )
             rows.append(setpoint.row())
         assert self._lower is not None

@@ -34,7 +34,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     },
     "crop": {"help": "part of the picture to convert", "metavar": "WxH+X+Y"},
     "fit": {
-        "help": "where --size has another aspect ratio (default: crop the middle)",
+        "help": "how to fit --size with another aspect ratio (default: crop the middle)",
         "choices": ("crop", "stretch"),
     },
     "fps": {

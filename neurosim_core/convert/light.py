@@ -109,7 +109,7 @@ def transfer_of(number: int) -> str | None:
     if number not in _TRANSFER_OF_NUMBER:
         raise ValueError(
             f"transfer function {number} of ITU-T H.273 is not known, known: {sorted(_TRANSFER_OF_NUMBER)};"
-            f" say what to take instead with --transfer"
+            f" choose another one with --transfer"
         )
     return _TRANSFER_OF_NUMBER[number]
 

@@ -13,27 +13,27 @@ from numpy.typing import NDArray
 from neurosim_core.packets import EventArrays, join_events
 
 FIELDS = ("events", "depth", "flow", "rgb", "imu", "pose")
-"""What a sample may have."""
+"""Fields of a sample."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
-    """One window of time (start_ns, stamp_ns]. What a source does not have, or was not asked for, is None."""
+    """One window of time (start_ns, stamp_ns]. Fields that are absent or not selected are None."""
 
     stamp_ns: int
     """End of the window [ns]."""
     start_ns: int
     """Start of the window, not part of it [ns]."""
     source: str
-    """Which flight it is of."""
+    """Name of the flight."""
     width: int
-    """Of the event camera [px]."""
+    """Width of the event camera [px]."""
     height: int
-    """Of the event camera [px]."""
+    """Height of the event camera [px]."""
     events: EventArrays | None = None
     """Events with start < t <= stamp, in whole microseconds."""
     depth: NDArray[np.float32] | None = None
-    """Planar z at the stamp [m], of a range camera the length of the ray; inf: no hit; shape [H, W]."""
+    """Planar z at the stamp [m], or the ray length of a `range` camera; inf: no hit; shape [H, W]."""
     flow: NDArray[np.float32] | None = None
     """The flow picture of the stamp [px], shape [H, W, 2]."""
     rgb: NDArray[np.uint8] | None = None
@@ -43,31 +43,31 @@ class Sample:
     pose: NDArray[np.float64] | None = None
     """p_WB [m] and q_WB (xyzw) at the stamp, shape [7]."""
     dropped_count: int = 0
-    """Events of the window that the camera lost."""
+    """Number of events of the window that the camera lost."""
     lost_count: int = 0
-    """Packets of the event camera that are missing in the window."""
+    """Number of missing packets of the event camera in the window."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EventBatch:
-    """The events of several windows: those of window i are `raw[offsets[i]:offsets[i + 1]]`.
+    """The events of several windows; window i is `raw[offsets[i]:offsets[i + 1]]`.
 
-    Where a `Loader` has put tensors in place of the arrays, grids are computed on the host as well, and are
+    In batches of a `Loader`, the arrays are tensors. Grids are still computed on the host, and returned as
     tensors on the device of the events.
     """
 
     raw: EventArrays
     """All events, window by window, shape [n]."""
     offsets: NDArray[np.int64]
-    """Where each window begins, and the end, shape [B + 1]."""
+    """Index of the first event of each window, and the number of events, shape [B + 1]."""
     start_us: NDArray[np.int64]
     """Start of each window [us], shape [B]."""
     stamp_us: NDArray[np.int64]
     """End of each window [us], shape [B]."""
     width: int
-    """Of the sensor [px]."""
+    """Width of the sensor [px]."""
     height: int
-    """Of the sensor [px]."""
+    """Height of the sensor [px]."""
 
     def __len__(self) -> int:
         return len(self.start_us)
@@ -173,15 +173,16 @@ class EventBatch:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Batch:
-    """B samples; as in `Sample`, with a first axis for the windows."""
+    """A batch of B samples: the fields of `Sample` with a leading axis of windows."""
 
     stamp_ns: NDArray[np.int64]
     """Shape [B]."""
     start_ns: NDArray[np.int64]
     """Shape [B]."""
     source: tuple[str, ...]
-    """Of each window."""
+    """Name of the flight of each window."""
     events: EventBatch | None
+    """Events of all windows."""
     depth: NDArray[np.float32] | None
     """Shape [B, H, W]."""
     flow: NDArray[np.float32] | None
@@ -189,9 +190,9 @@ class Batch:
     rgb: NDArray[np.uint8] | None
     """Shape [B, H, W, 3] or [B, H, W]."""
     imu: NDArray[np.float64] | None
-    """Shape [n, 7]: of all windows, one after the other."""
+    """Samples of all windows, concatenated, shape [n, 7]."""
     imu_offsets: NDArray[np.int64]
-    """Where the samples of each window begin in `imu`, and the end, shape [B + 1]."""
+    """Index of the first sample of each window in `imu`, and the number of samples, shape [B + 1]."""
     pose: NDArray[np.float64] | None
     """Shape [B, 7]."""
     dropped_count: NDArray[np.int64]
@@ -207,7 +208,7 @@ def collate(samples: Sequence[Sample]) -> Batch:
     """Return samples as a batch.
 
     Raises:
-        ValueError: There are none, or they differ in size or in what they have.
+        ValueError: There are no samples, or their sizes or fields differ.
     """
     if not samples:
         raise ValueError("a batch needs at least one sample")
@@ -219,7 +220,9 @@ def collate(samples: Sequence[Sample]) -> Batch:
     for name, has in present.items():
         if any(has) != all(has):
             missing = next(sample.source for sample, h in zip(samples, has, strict=True) if not h)
-            raise ValueError(f"{missing} has no {name}, which others have: fields= says what to take")
+            raise ValueError(
+                f"{missing} has no {name}, but other samples have: select common fields by fields="
+            )
     stamp_ns = np.array([sample.stamp_ns for sample in samples], np.int64)
     start_ns = np.array([sample.start_ns for sample in samples], np.int64)
     events = None

@@ -6,6 +6,7 @@ import argparse
 import os
 import shlex
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -123,6 +124,12 @@ def add_compare_parser(commands: argparse._SubParsersAction[argparse.ArgumentPar
     parser.set_defaults(command=_compare)
 
 
+_COLUMNS = (
+    "interval: median time between two events of a pixel; silent: pixels without events; cycles/px: mean\n"
+    "spatial frequency of 20 ms of events, higher where edges are sharper or noise is"
+)
+
+
 def _compare(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.table import Table
@@ -135,14 +142,18 @@ def _compare(arguments: argparse.Namespace) -> int:
     size = None if arguments.size is None else read_size(arguments.size)
     console = Console(soft_wrap=not sys.stdout.isatty())
     table = Table(box=None, pad_edge=False, header_style="dim")
-    columns = ("file", "pixels", "events", "s", "M/s", "brighter", "interval", "silent", "c/px")
+    columns = ("file", "pixels", "events", "s", "M/s", "brighter", "interval", "silent", "cycles/px")
     for name in columns:
-        table.add_column(name, justify="left" if name == "file" else "right")
+        table.add_column(name, justify="left" if name == "file" else "right", overflow="fold")
     stats = []
+    files = find_recordings(arguments.files)
+    names = Counter(path.name for path in files)
     with console.status("reading") as status:
-        for path in find_recordings(arguments.files):
+        for path in files:
             status.update(f"reading {path}")
             one = measure_events(path, size=size, sensor=arguments.sensor)
+            if names[path.name] > 1:  # each flight has a flight.h5
+                one.name = str(path)
             stats.append(one)
             table.add_row(
                 one.name,
@@ -158,6 +169,7 @@ def _compare(arguments: argparse.Namespace) -> int:
         status.update("drawing")
         draw_comparison(stats, arguments.out)
     console.print(table)
+    console.print(_COLUMNS, style="dim", highlight=False)
     print_notes((note for one in stats for note in one.notes), console)
     console.print(f"{arguments.out}", markup=False, highlight=False)
     return 0

@@ -18,18 +18,18 @@ _POLL_S = 0.002
 
 
 class LiveSource:
-    """The vehicles of running simulators; each is one flight after the other.
+    """The vehicles of running simulators, over Cortex; each yields one flight after the other.
 
-    Subscriptions hold up the simulator for a moment rather than lose a message; what is lost nevertheless is
-    counted in `Sample.lost_count`. After a reset of the simulator its next flight begins. To see a flight
-    from its first window, start the simulator with `--lockstep`, or reset it.
+    Subscriptions block the simulator for a short time to avoid losses; lost messages are counted in
+    `Sample.lost_count`. A reset of the simulator begins its next flight. To get a flight from its first
+    window, start the simulator with `--lockstep`, or reset it.
 
     Args:
-        namespaces: Prefix of the topics of each simulator; none: the only one.
-        vehicles: Whose sensors; None: all.
-        timeout_s: Give up after so long without a message, once a flight has begun; end there [s].
-        start_s: Give up after so long without a simulator [s].
-        on_join: Called once all sensors are subscribed to: the time to start controllers.
+        namespaces: Prefix of the topics of each simulator; by default the only simulator.
+        vehicles: Names of vehicles; None: all.
+        timeout_s: The source ends after this time without a message, once a flight has begun [s].
+        start_s: Longest wait for a simulator [s].
+        on_join: Called when all sensors are subscribed; start controllers there.
     """
 
     def __init__(
@@ -47,11 +47,11 @@ class LiveSource:
         self.skipped_count = 0
 
     def samples(self, config: WindowConfig) -> Iterator[Sample]:
-        """See `SampleSource.samples`; ends when nothing has come for a while.
+        """See `SampleSource.samples`; ends after `timeout_s` without a message.
 
         Raises:
             TimeoutError: There is no simulator, or it sends nothing.
-            ValueError: It does not have what is wanted.
+            ValueError: The simulator lacks a field.
         """
         from cortex import Node
 
@@ -73,7 +73,7 @@ class LiveSource:
                     time.sleep(_POLL_S)
             if not started:
                 raise TimeoutError(
-                    "no simulator sends the sensors that are wanted; one that streams waits for its first "
+                    "no simulator publishes the requested sensors; a streaming simulator waits for its first "
                     "command, which `neurosim fly` sends"
                 )
             for flight in flights:

@@ -23,20 +23,20 @@ from neurosim_core.install import need
 from neurosim_core.render.launch import limit_cores
 
 SEEDS_APART = 10_000
-"""Between the first flights of two simulators that fly side by side."""
+"""Difference between the seeds of the first flights of two simulators."""
 _BLOCK = 16
-"""Windows that travel together."""
+"""Number of windows in a message."""
 _WAITING = 4
-"""Blocks of a simulator that may wait to be taken."""
+"""Largest number of waiting blocks of a simulator."""
 
 
 @contextlib.contextmanager
 def cluster(address: str) -> Iterator[Any]:
-    """Give the module `ray`, connected to a cluster; one that was started here ends with it.
+    """Yield the module `ray`, connected to a cluster; a cluster that is started here ends with the block.
 
     Args:
-        address: As `ray.init` takes it: `local` starts a cluster on this machine, `auto` finds one that runs
-            here, else host:port. In a process that is connected already, that connection is used.
+        address: Address for `ray.init`: `local` starts a cluster on this machine, `auto` finds a running one
+            on this machine, else host:port. An existing connection of the process is reused.
 
     Raises:
         ImportError: Ray is not installed.
@@ -50,9 +50,9 @@ def cluster(address: str) -> Iterator[Any]:
     try:
         ray.init(address=address, log_to_driver=False, **options)
     except ConnectionError as error:
-        where = "on this machine (`ray start --head` begins one)" if address == "auto" else f"at {address}"
+        where = "on this machine (`ray start --head` starts one)" if address == "auto" else f"at {address}"
         raise ConnectionError(
-            f"there is no Ray cluster {where}; `local` is one for this time only"
+            f"there is no Ray cluster {where}; `local` starts one for this command"
         ) from error
     try:
         yield ray
@@ -61,17 +61,17 @@ def cluster(address: str) -> Iterator[Any]:
 
 
 class RaySource:
-    """Simulators on a cluster, each of which flies one flight after the other; see `Stream`.
+    """Simulators on a Ray cluster, each of which flies one flight after the other; see `Stream`.
 
-    Flight k of simulator n has seeds of scene, path and noise that are `first + 10,000 n + k` further than
-    those of the settings. Its windows are those of the same settings in this process, to the byte.
+    Flight k of simulator n adds `first + 10,000 n + k` to the seeds of scene, path and noise in the settings.
+    Its windows equal those of the same settings in this process, to the byte.
 
     Args:
-        config: Of a flight, as `load_config` returns or accepts it; files of scenes must be on all machines.
-        simulators: How many fly side by side; each takes one CPU.
+        config: Settings, or anything that `load_config` accepts; files of scenes must be on all machines.
+        simulators: Number of parallel simulators; each uses one CPU.
         address: See `cluster`.
         first: See above.
-        flights: Of each simulator; None: for ever.
+        flights: Number of flights of each simulator; None: endless.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Batches of windows, from recordings in any order, or from simulators as they come."""
+"""Batches of windows, from recordings in any order, or from simulators in the order of time."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from neurosim_core.data.windows import WindowConfig
 
 _log = logging.getLogger(__name__)
 _OPEN_MAX = 64
-"""Most files that are open at a time."""
+"""Largest number of open files."""
 
 
 class Dataset:
-    """The windows of recordings, by number: what `torch.utils.data.DataLoader` calls a map-style data set.
+    """The windows of recordings by index: a map-style data set for `torch.utils.data.DataLoader`.
 
-    Give the loader `collate_fn=neurosim_core.data.collate`. Reading starts no device, so that workers may be
+    Use the loader with `collate_fn=ns.data.collate`. Reading does not start a device, so workers can be
     forked.
 
     Args:
@@ -36,17 +36,17 @@ class Dataset:
             shard (`write_shards`), a folder with such files or with a data set of `neurosim dataset`, or a
             list of these.
         window_s: Length of a window [s].
-        stride_s: From one window to the next [s]; None: they follow on each other.
-        ends: Field at whose packets windows end, such as depth of MVSEC, whose times are no multiples of
-            anything; None: at multiples of the stride.
-        fields: What to take, of events, depth, flow, rgb, imu, pose; None: all that there is.
+        stride_s: Time from one window to the next [s]; None: `window_s`.
+        ends: Field whose packets end the windows, such as depth of MVSEC, which has irregular times; None:
+            windows end at multiples of the stride.
+        fields: Fields to read, of events, depth, flow, rgb, imu, pose; None: all that the source has.
         sensors: Name of the sensor for a field, such as {"depth": "depth_left"}; by default the first.
 
     Attributes:
         flights: The recordings, in the order of their paths.
 
     Raises:
-        ValueError: A file is no recording, or does not have what is wanted; or all are shorter than a window.
+        ValueError: A file is no recording or lacks a field, or all flights are shorter than a window.
         FileNotFoundError: There is no such file.
     """
 
@@ -81,11 +81,11 @@ class Dataset:
 
     @property
     def skipped_count(self) -> int:
-        """Windows that were left out, as their ground truth is missing."""
+        """Number of windows that were skipped because their ground truth is missing."""
         return sum(flight.skipped_count for flight in self.flights)
 
     def _tell_missing(self, config: WindowConfig) -> None:
-        """Refuse windows that fit into no flight; say it where most of them have no ground truth."""
+        """Raise if no flight is as long as a window; warn if most windows have no ground truth."""
         count, skipped = sum(map(len, self.flights)), self.skipped_count
         spans_s = [1e-9 * flight.span_ns for flight in self.flights]
         if not count and max(spans_s) < config.window_s:
@@ -96,7 +96,7 @@ class Dataset:
             )
         if skipped > count:
             _log.warning(
-                "%d of %d windows are left out, as their ground truth is not stamped at their end: choose "
+                "%d of %d windows are skipped: their ground truth is not stamped at their end; choose "
                 "window_s or stride_s as multiples of its period, or fewer fields",
                 skipped, skipped + count,
             )  # fmt: skip
@@ -110,7 +110,7 @@ class Dataset:
         return self.read(index % len(self), 1)[0]
 
     def read(self, first: int, count: int) -> list[Sample]:
-        """Return windows with consecutive numbers."""
+        """Return `count` consecutive windows from index `first`."""
         samples: list[Sample] = []
         while count > 0:
             number = int(np.searchsorted(self._begins, first, side="right")) - 1
@@ -133,7 +133,7 @@ class Position(NamedTuple):
     """The position in a stream."""
 
     epoch: int
-    """Number of times that it has been read to its end."""
+    """Number of completed epochs."""
     batch: int
     """The next batch of this epoch."""
 
@@ -145,24 +145,25 @@ class Stream:
     alone, not on workers; `state_dict` and `load_state_dict` continue in the middle of an epoch.
 
     Args:
-        source: As for `Dataset`; or settings, or their file, that are flown in this process; or a
-            `Simulation`; or `LiveSource(...)`, running simulators.
+        source: A source of `Dataset`; settings or a settings file, flown in this process; a `Simulation`; or
+            a source such as `LiveSource(...)` or `RaySource(...)`.
         window_s: Length of a window [s].
-        stride_s: From one window to the next [s]; None: they follow on each other.
-        ends: Field at whose packets windows end, of recordings; see `Dataset`.
-        batch: Windows of a batch, a multiple of `sequence`; the last one of an epoch may have fewer.
-        fields: What to take, of events, depth, flow, rgb, imu, pose; None: all that there is.
+        stride_s: Time from one window to the next [s]; None: `window_s`.
+        ends: Field whose packets end the windows, for recordings only; see `Dataset`.
+        batch: Number of windows in a batch, a multiple of `sequence`; the last batch of an epoch may be
+            smaller.
+        fields: Fields to read, of events, depth, flow, rgb, imu, pose; None: all that the source has.
         sensors: Name of the sensor for a field; by default the first.
-        shuffle: Take the recordings' sequences in random order.
-        sequence: Consecutive windows that stay together, for networks with memory; read faster, too. What is
-            left at the end of a flight is left out.
-        seed: Of the order.
-        rank: Of this process, of `ranks` that share the windows; all get equally many.
-        ranks: See `rank`.
-        transform: Called with each batch, in the worker: what it returns is yielded.
+        shuffle: Read the sequences of recordings in random order.
+        sequence: Number of consecutive windows that stay together, for networks with memory; also faster to
+            read. An incomplete sequence at the end of a flight is skipped.
+        seed: Seed of the order.
+        rank: Index of this process among `ranks` processes, which divide the windows equally.
+        ranks: Number of processes.
+        transform: Function of a batch; the stream yields its result.
 
     Raises:
-        ValueError: An argument is out of range, or goes with recordings only.
+        ValueError: An argument is out of range, or is for recordings only.
     """
 
     @names_arguments
@@ -218,7 +219,7 @@ class Stream:
 
     @property
     def skipped_count(self) -> int:
-        """Windows that were left out, as their ground truth is missing."""
+        """Number of windows that were skipped because their ground truth is missing."""
         source: Any = self._source if self._data is None else self._data
         return int(source.skipped_count)
 

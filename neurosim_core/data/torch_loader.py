@@ -28,23 +28,23 @@ class _Batches:
 
 
 class Loader:
-    """Yields what `Stream` yields, with tensors of PyTorch, in the same order with any number of workers.
+    """Yields the batches of a `Stream` as PyTorch tensors, in the same order with any number of workers.
 
-    A loop over it reads one epoch. Workers are forked where the simulator is not loaded, else spawned: then
-    `transform` must be a function of a module. They hand tensors over in shared memory.
+    A loop over it reads one epoch. Workers are forked if the simulator is not loaded in the process, else
+    spawned: `transform` must then be a function of a module. Workers send tensors in shared memory.
 
     Args:
         source: Recordings; without workers any source of `Stream`.
-        workers: Processes that read.
-        transform: Called with each batch in its worker: what it returns is yielded, such as
-            `(batch.events.voxel(5), batch.depth)`; arrays in it become tensors.
-        pin_memory: Yield tensors in pinned memory, from which copies to a CUDA device do not wait.
+        workers: Number of reading processes.
+        transform: Function of a batch, called in the worker; the loader yields its result, such as
+            `(batch.events.voxel(5), batch.depth)`, with tensors in place of arrays.
+        pin_memory: Yield tensors in pinned memory, for asynchronous copies to a CUDA device.
         device: Yield tensors on this device; the next batch is copied while one is in use. None: on the host.
-        options: As for `Stream`.
+        options: Other arguments of `Stream`.
 
     Raises:
         ImportError: PyTorch is not installed.
-        ValueError: As for `Stream`; or workers are to be spawned, and `transform` cannot be sent to them.
+        ValueError: See `Stream`; or workers are spawned, and `transform` cannot be pickled.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Loader:
         more: dict[str, Any] = {}
         if workers:
             if not self.stream.is_recorded:
-                raise ValueError("workers read recordings; simulators run by themselves: leave workers at 0")
+                raise ValueError("workers are for recordings: with a source that simulates, set workers=0")
             method = "spawn" if "warp" in sys.modules or sys.platform != "linux" else "fork"
             if method == "spawn":
                 _require_sendable(transform)

@@ -44,15 +44,22 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         metavar="S",
         help="time of a change of light, which is linear in its logarithm [s] (default: 0)",
     )
-    parser.add_argument("-o", "--out", type=Path, default=Path("my_camera.yaml"), metavar="YAML")
+    parser.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        default=Path("my_camera.yaml"),
+        metavar="YAML",
+        help="settings to write (default: my_camera.yaml)",
+    )
     parser.add_argument(
         "--also",
         nargs=2,
         action="append",
         default=[],
         metavar=("FILE", "LUX"),
-        help="the still surface at another illuminance; may be repeated. The rates of all pixels go to a "
-        ".npz beside the settings, which take noise from it",
+        help="the still surface at another illuminance; may be repeated. A .npz beside the settings then "
+        "has the noise rates of all pixels, and the settings refer to it",
     )
     parser.add_argument("--size", metavar="WxH", help="resolution, for files that do not give it")
     parser.add_argument("--sensor", default="", metavar="NAME", help="event camera, for files with several")

@@ -116,10 +116,10 @@ def _vary(
 
 
 class CameraDraws:
-    """Draws how a camera is mounted and looks, and the light, when episodes begin; launches only.
+    """Draws mount, lens and light at the begin of episodes; launches only.
 
-    `sim`: where the camera is, made with `lenses` of `draw_lenses`; with `own_light` where light is drawn.
-    `lens_table`: what the lenses differ in, of `draw_lenses`.
+    `sim`: the simulation of the camera, made with `lenses` of `draw_lenses`, and with `per_world_light` if
+    the light is drawn. `lens_table`: parameters of these lenses, from `draw_lenses`.
     """
 
     def __init__(

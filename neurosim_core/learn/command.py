@@ -345,9 +345,7 @@ def fly_policy(arguments: argparse.Namespace, overrides: Mapping[str, Any]) -> i
     from neurosim_core.learn import pilot
 
     if arguments.config is not None:
-        raise ValueError(
-            "--policy flies in the default apartment; say --set scene.kind=mesh --set scene.file=..."
-        )
+        raise ValueError("--policy flies in the default apartment; say --scene FILE")
     given = {key: value for key, value in overrides.items() if key not in ("duration_s", "seed")}
     speed_m_s = pilot.fly_policy(
         arguments.policy,

@@ -113,7 +113,7 @@ class Env:
             event_capacity=_EVENTS_PER_PIXEL * task.camera["width"] * task.camera["height"],
             sorted=False,
             lenses={CAMERA: lenses} if sees and lenses else None,
-            own_light=sees and self.randomisation.light_factor != (1.0, 1.0),
+            per_world_light=sees and self.randomisation.light_factor != (1.0, 1.0),
             **({"scenes": scenes} if models is None else {"models": models}),
         )
         self.num_envs, self.action_count = worlds, 4

@@ -62,7 +62,7 @@ class Pilot:
         metadata = self._session.get_modelmeta().custom_metadata_map
         if CARD not in metadata:
             raise ValueError(
-                f"{file} is no policy of `neurosim learn`: it does not say what it was trained for"
+                f"{file} is no policy of `neurosim learn`: it has no description of its training"
             )
         self.card: dict[str, Any] = json.loads(metadata[CARD])
         if (mode := self.card.get("mode", "rates")) != "rates":

@@ -68,7 +68,7 @@ def train_population(
             for group in groups.values():
                 ray.util.remove_placement_group(group)
     if failures:
-        raise RuntimeError(f"these trainings failed: {', '.join(failures)}; what was printed says why")
+        raise RuntimeError(f"these trainings failed: {', '.join(failures)}; see their output above")
 
 
 def _needs(config: TrainConfig) -> dict[str, int]:

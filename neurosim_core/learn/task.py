@@ -1,4 +1,4 @@
-"""The base class of tasks: it says what is observed, what is rewarded, and when an episode ends."""
+"""The base class of tasks, which define observations, rewards and the ends of episodes."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ MIRROR_ACTION = (1.0, -1.0, 1.0, -1.0)
 """Signs of an action when left and right are exchanged."""
 
 Observations = dict[str, torch.Tensor]
-"""What is observed, by name: float32, shape [N, ...]."""
+"""Observations by name: float32 tensors, shape [N, ...]."""
 
 
 @dataclass(kw_only=True, eq=False)
 class View:
-    """The state of all worlds at the end of a step, as a task sees it: views of the same memory in each step.
+    """The state of all worlds at the end of a step. Its tensors are overwritten by the next step.
 
     Vectors in B are in the body frame.
     """
@@ -46,73 +46,76 @@ class View:
     goal_B: torch.Tensor
     """From the vehicle to the goal, in B [m], [N, 3]."""
     gyro: torch.Tensor
-    """Body rate as measured [rad/s], [N, 3]."""
+    """Measured body rate [rad/s], [N, 3]."""
     gravity_measured: torch.Tensor
-    """`gravity_B` as an attitude estimator gives it, [N, 3]."""
+    """`gravity_B` with the errors of an attitude estimator, [N, 3]."""
     clearance: torch.Tensor
-    """Distance from the centre to the scene [m], to a voxel, [N, 1]."""
+    """Distance from the vehicle's centre to the scene [m], with the resolution of a voxel, [N, 1]."""
     probes: torch.Tensor
-    """Distance to the scene of the points `Task.probes` [m], to a voxel, [N, K]."""
+    """Distance from the points `Task.probes` to the scene [m], with the resolution of a voxel, [N, K]."""
     scenes: Sequence[SceneConfig]
     """Settings of the scenes."""
     scene: torch.Tensor
-    """Which of them each world is in, int64, [N]."""
+    """Index of the scene of each world, int64, [N]."""
     surface: torch.Tensor | None
     """Event surface, [N, C, H, W]; None: there is no camera."""
     action: torch.Tensor
     """The last action, in [-1, 1], [N, 4]."""
     last_action: torch.Tensor
-    """The one before, [N, 4]."""
+    """The action before the last one, [N, 4]."""
     crashed: torch.Tensor
-    """The vehicle touched the scene, or could not be simulated on, bool, [N]."""
+    """The vehicle touched the scene, or its motion could not be integrated, bool, [N]."""
     elapsed_s: torch.Tensor
-    """Time since the episode began [s], [N]."""
+    """Time since the begin of the episode [s], [N]."""
     draws: torch.Tensor
-    """Uniform numbers in (0, 1) of the episode, [N, 16]; the last five are used, the others are a task's."""
+    """Uniform random numbers in (0, 1) of the episode, [N, 16]; the first eleven are for tasks."""
     bodies: torch.Tensor
-    """Where the bodies are that were thrown, and their velocities, in W [m, m/s], [N, B, 6]."""
+    """Positions and velocities of the thrown bodies in W [m, m/s], [N, B, 6]."""
     step_s: float
     """Length of a step [s]."""
     vehicle: MultirotorConfig
+    """Parameters of the vehicle."""
 
 
 class Task:
-    """The base of tasks: settings, and what must be written for a task of one's own.
+    """The base class of tasks: settings, and the methods that a task defines.
 
-    A task is registered by `@ns.register("task", "name")`. All methods work on tensors of all worlds, must
-    not wait for the device (no `.item()`, no `if tensor`), and must keep worlds apart.
+    `@ns.register("task", "name")` registers a task. All methods work on tensors of all worlds. They must not
+    wait for the device (no `.item()`, no `if tensor`), nor mix worlds.
     """
 
     rate_hz: float = 50.0
     """Steps a second."""
     rate_on_cpu_hz: float | None = None
-    """The same in trainings on a CPU, where a render is what a step costs; None: no other."""
+    """Steps a second in trainings on a CPU, where renders dominate the cost; None: `rate_hz`."""
     episode_s: float = 6.0
-    """When an episode is cut (truncated) [s]."""
+    """Time after which an episode is truncated [s]."""
     camera: Mapping[str, Any] = {"width": 24, "height": 24, "horizontal_fov_rad": 1.6}
     """Lens of the event camera."""
     mount: Mapping[str, Any] = {"position_m": (0.1, 0.0, 0.03)}
-    """Where it sits on the body: {position_m, rpy_rad}; a positive pitch looks down."""
+    """Pose of the camera on the body: {position_m, rpy_rad}; positive pitch looks down."""
     surface: SurfaceConfig = LeakySurface(tau_s=(0.02, 0.2))
-    """How events are shown."""
+    """Representation of events."""
     threshold: float = 0.1
-    """Of the event camera, both ways."""
+    """ON and OFF threshold of the event camera."""
     pixel: Mapping[str, Any] = {}
     """Settings of its pixels, such as {preset: davis346}, in place of `threshold`; {}: ideal pixels."""
     renders_per_step: int = 1
-    """Pictures that events are made of."""
+    """Number of renders in a step."""
     rays_per_pixel: int = 4
-    """Rays that a pixel takes the mean of: with one, half the events of a coarse picture are false."""
+    """Rays per pixel; with one, half the events of a coarse picture are false."""
     vehicle: Mapping[str, Any] = {"preset": "hummingbird"}
     """Settings of the vehicle."""
     start: StartConfig = StartConfig()
+    """Random starts of episodes."""
     randomisation: Randomisation = Randomisation()
+    """Random values of each episode."""
     training: Randomisation | None = None
-    """What training draws in its place: with more of it, students cope with other scenes; None: the same."""
+    """Wider randomisation for training, which helps students in new scenes; None: `randomisation`."""
     mode: ActionMode = "rates"
-    """What the four numbers of an action command. `rates`: thrust, body rates. `attitude`: thrust, roll,
+    """Meaning of the four numbers of an action. `rates`: thrust, body rates. `attitude`: thrust, roll,
     pitch, change of the heading. `velocity`: ahead, left, up, rate of the heading. `motor_speeds`: the thrust
-    of each of four rotors."""
+    of four rotors."""
     rate_max_rad_s: Sequence[float] = (4.0, 4.0, 2.0)
     """Body rates of an action of 1 [rad/s]; the last is that of the heading, too."""
     thrust_span: float = 0.6
@@ -122,9 +125,9 @@ class Task:
     speed_max_m_s: float = 2.0
     """Speed of an action of 1 along each axis, in mode `velocity` [m/s]."""
     bodies: Mapping[str, Any] = {}
-    """Settings of bodies that are thrown in each world as `throw` says; there can be one scene then."""
+    """Settings of bodies, which `throw` throws in each world; needs a single scene."""
     probes: Sequence[tuple[float, float, float]] = ()
-    """Points whose distance to the scene is seen [m]: ahead, to the left and above, in a level frame."""
+    """Points for `View.probes` [m]: ahead, to the left and above the vehicle, in a level frame."""
     groups: Mapping[str, Sequence[str]] = {
         "actor": ("state",),
         "critic": ("state",),
@@ -133,31 +136,31 @@ class Task:
     }
     """Names of observations that each group sees: actor, critic, teacher, student."""
     teacher: Mapping[str, Any] = {}
-    """Settings of `PpoConfig` for the teacher, where they differ from those that hover needs."""
+    """Settings of `PpoConfig` for the teacher that differ from those of `hover`."""
     student: Mapping[str, Any] = {}
-    """And of `DaggerConfig` for the student."""
+    """Settings of `DaggerConfig` for the student that differ from those of `hover`."""
     hint: str = "velocity"
-    """Name of the observation that students estimate besides."""
+    """Name of the observation that students learn to estimate."""
     mirror: Mapping[str, Sequence[float]] = {}
-    """Signs of the numbers of observations when left and right are exchanged, for students; {}: not known."""
+    """Signs of observations when left and right are exchanged, for students; {}: no mirroring."""
 
     def scenes(self, *, unseen: bool) -> list[dict[str, Any]]:
-        """Return settings of the scenes to train in, or of others."""
+        """Return settings of the training scenes, or of other scenes for tests."""
         first = 100 if unseen else 0
         return [{"kind": "apartment", "rooms": 1, "seed": first + seed} for seed in range(4)]
 
     def routes(self, scene: SceneConfig) -> Routes | None:
-        """Return where episodes in a scene begin and lead to; None: anywhere, as `start` says."""
+        """Return starts and goals of episodes in a scene; None: random ones, by `start`."""
         return None
 
     def throw(
         self, position: torch.Tensor, orientation: torch.Tensor, draws: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return where `bodies` are when an episode begins, and their velocities; then they fall freely.
+        """Return the positions and velocities of `bodies` at the begin of an episode; then they fall freely.
 
         Args:
-            position: p_WB where the vehicle begins [m], float64, [N, 3].
-            orientation: q_WB there, xyzw, float64, [N, 4].
+            position: p_WB at the begin [m], float64, [N, 3].
+            orientation: q_WB at the begin, xyzw, float64, [N, 4].
             draws: `View.draws` of the episode.
 
         Returns:
@@ -166,17 +169,17 @@ class Task:
         raise NotImplementedError
 
     def command(self, view: View) -> torch.Tensor:
-        """Return what the last actions command, rows of `control.modes.MODES[mode]`, [N, width]."""
+        """Return the commands of the last actions, rows of `control.modes.MODES[mode]`, [N, width]."""
         return COMMANDS[self.mode](self, view)
 
     def begin(self, view: View, mask: torch.Tensor) -> None:
-        """Note that the episodes of the worlds of a mask (bool, [N]) have begun."""
+        """Handle the begin of episodes in the worlds of a mask (bool, [N])."""
 
     def advance(self, view: View) -> None:
-        """Note that a step has been made; before rewards and observations are asked for."""
+        """Handle the end of a step, before rewards and observations are computed."""
 
     def observe(self, view: View) -> Observations:
-        """Return what can be observed, by name; the event surfaces are added as `events`."""
+        """Return the observations by name; the environment adds event surfaces as `events`."""
         raise NotImplementedError
 
     def reward(self, view: View) -> torch.Tensor:
@@ -184,13 +187,13 @@ class Task:
         raise NotImplementedError
 
     def terminated(self, view: View) -> torch.Tensor:
-        """Return which episodes end for good, bool, [N]; those that crashed end in any case."""
+        """Return the episodes that terminate, bool, [N]; crashed episodes always do."""
         return view.crashed
 
     def metrics(self, view: View) -> dict[str, torch.Tensor]:
-        """Return what tells how an episode goes, [N] each; read at its end.
+        """Return metrics of the episodes, [N] each; they are read at the end of an episode.
 
-        `success` and `crash` are 1 or 0; where they are not returned, success is not to have crashed.
+        `success` and `crash` are 1 or 0; by default, an episode without a crash is a success.
         """
         crash = view.crashed.float()
         return {"success": 1.0 - crash, "crash": crash}
@@ -207,7 +210,7 @@ def _rates(task: Task, view: View) -> torch.Tensor:
 
 
 def _attitude(task: Task, view: View) -> torch.Tensor:
-    """Thrust, roll, pitch, and how far to turn the heading from what it is."""
+    """Thrust, roll, pitch, and the change of the heading."""
     roll, pitch, change = (0.5 * task.tilt_max_rad * view.action[:, 1:]).unbind(1)  # half the angles
     yaw = 0.5 * _heading(view) + change
     (cx, sx), (cy, sy), (cz, sz) = ((half.cos(), half.sin()) for half in (roll, pitch, yaw))
@@ -245,11 +248,11 @@ COMMANDS: dict[str, Callable[[Task, View], torch.Tensor]] = {
     "velocity": _velocity,
     "motor_speeds": _motor_speeds,
 }
-"""By mode: the commands of the last actions, [N, width of the mode]."""
+"""Functions by mode that return the commands of the last actions, [N, width of the mode]."""
 
 
 def hover_command(mode: ActionMode, vehicle: MultirotorConfig) -> list[float]:
-    """Return what is commanded before the first action takes effect; an attitude is turned to the heading."""
+    """Return the command before the first action; an attitude is then turned to the heading."""
     if mode not in COMMANDS:
         raise ValueError(f"unknown mode {mode!r} of actions, known: {', '.join(COMMANDS)}")
     if mode == "motor_speeds":
@@ -261,7 +264,7 @@ def hover_command(mode: ActionMode, vehicle: MultirotorConfig) -> list[float]:
 
 
 def turn(q: torch.Tensor, vectors: torch.Tensor, *, back: bool = False) -> torch.Tensor:
-    """Return vectors in B turned to W by q_WB (xyzw), or back to B, [N, 3]."""
+    """Return vectors in B rotated to W by q_WB (xyzw), or with `back` from W to B, [N, 3]."""
     xyz, w = (-q[:, :3] if back else q[:, :3]), q[:, 3:]
     across = 2.0 * torch.linalg.cross(xyz, vectors)
     return vectors + w * across + torch.linalg.cross(xyz, across)

@@ -218,7 +218,7 @@ class RemoteRendererConfig(RendererConfig):
         ):
             node.close()
             raise RemoteRendererError(
-                f"nobody renders on {self.topic} (waited {self.timeout_s:g} s): start the other process first"
+                f"no renderer serves {self.topic} (waited {self.timeout_s:g} s): start its process first"
             )
         connected = RemoteScene(
             config=config,

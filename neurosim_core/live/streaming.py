@@ -305,9 +305,9 @@ def frame_counts(state: State, batch: Batch) -> Counter[str]:
     """Return the frames that a batch has to render, by camera: instants of an event camera, or pictures."""
     counts: Counter[str] = Counter()
     for index, group in enumerate(state.groups):
-        stamps_ns = [boundary.stamp_ns for boundary in batch.boundaries if index in boundary.groups]
-        for name in batch.wanted.intersection(group.frames):
+        stamps_ns = [batch.stamps_ns[place] for place in batch.stretch.group_places.get(index, ())]
+        for name in batch.enabled_cameras.intersection(group.frames):
             counts[name] += len(stamps_ns)
-        for name in batch.wanted.intersection(group.images):
+        for name in batch.enabled_cameras.intersection(group.images):
             counts[name] += sum(map(group.images[name].rate.has_tick, stamps_ns))
     return +counts

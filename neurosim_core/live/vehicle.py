@@ -262,7 +262,7 @@ class VehicleNode:
     def _choose_cameras(self) -> None:
         """Render the cameras that somebody looks at, from the next control period on."""
         names = self._cameras & self._active
-        if self.state.wanted != names:
+        if self.state.enabled_cameras != names:
             sim.select_cameras(self.model, self.state, names)
 
 

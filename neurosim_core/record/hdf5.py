@@ -143,10 +143,14 @@ class RecordingWriter:
         self._file = h5py.File(self._disk, "w", libver=("earliest", "v110"), fs_strategy="none")
         cameras = [s.name for s in header.sensors if s.has_events]
         self._root_camera = cameras[0] if cameras else None
-        # A daemon, which works until the interpreter has called all its exit handlers.
-        threading.Thread(target=self._write_flushes, name="recording", daemon=True).start()
         self._is_released = threading.Event()
-        threading.Thread(target=self._watch_disk, name="disk", daemon=True).start()
+        # Daemons, which work until the interpreter has called all its exit handlers.
+        self._threads = [
+            threading.Thread(target=self._write_flushes, name="recording", daemon=True),
+            threading.Thread(target=self._watch_disk, name="disk", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
         self._is_exiting = False
         atexit.register(self._close_at_exit)
         disown_when_forked(self)
@@ -234,6 +238,8 @@ class RecordingWriter:
         atexit.unregister(self._close_at_exit)
         self._is_released.set()
         self._flushes.put(None)
+        for thread in self._threads:  # one that ends with the interpreter may have the lock of h5py, for ever
+            thread.join()
         self._pool.shutdown()
         self._file.close()
         self._disk.close()

@@ -134,6 +134,6 @@ def refuse_several(kind: str, shape: Mapping[str, Any]) -> None:
     """
     worlds = shape.get("worlds")
     if worlds is not None and worlds.count > 1:
-        raise ValueError(f"{worlds.count} worlds are rendered by renderer 'warp' only, not by {kind!r}")
+        raise ValueError(f"{worlds.count} worlds need the renderer 'warp', got {kind!r}")
     if shape.get("times") is not None:
         raise ValueError(f"rays with times of their own need renderer: warp, not {kind!r}")

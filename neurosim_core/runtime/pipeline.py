@@ -1,8 +1,8 @@
-"""How batches share a device: streams, the fences between them, and graphs. It changes no result.
+"""The pipeline of batches on a device: streams, the fences between them, and graphs. It changes no result.
 
-A batch goes through three stages: its flight, its renders, and the scans of its frames. With several batches
-in flight each stage has streams of its own, and the next batch flies while this one is rendered. With one,
-all its launches are one graph, where they may be.
+A batch passes three stages: its flight, its renders, and the scans of its frames. With several batches in
+flight, each stage has its own streams, and the next batch flies while this one is rendered. With one batch in
+flight, all its launches form one graph if `single_graph` allows it.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from neurosim_core.runtime.timing import timed
 
 
 class Pipeline:
-    """The stages of batches, which are counted; each is launched by one thread at a time.
+    """Runs the stages of numbered batches on a device. One thread at a time launches a stage.
 
     Args:
         device: Where to launch.
-        wall_s: Wall-clock time by phase [s], which is added to.
-        in_flight: The most batches that are launched and not read.
-        flown_ahead: The most batches that are flown and not rendered.
-        as_one: All launches of a `batch` are one graph; nothing of it is launched before its end.
-        chooses: The flight has to be known before what is rendered is.
+        wall_s: Wall-clock time by phase [s]; the pipeline adds to it.
+        in_flight: Largest number of batches that are launched and not read.
+        flown_ahead: Largest number of batches that are flown and not rendered.
+        single_graph: Collect all launches of a `batch` and launch them as one graph at its end.
+        adaptive: The motion of a batch decides which instants are rendered.
 
     Attributes:
-        graphs: The launches that came before.
+        graphs: The cache of recorded graphs.
     """
 
     def __init__(
@@ -38,35 +38,35 @@ class Pipeline:
         *,
         in_flight: int,
         flown_ahead: int,
-        as_one: bool,
-        chooses: bool,
+        single_graph: bool,
+        adaptive: bool,
     ) -> None:
         self.in_flight, self.flown_ahead = in_flight, flown_ahead
         self.graphs = GraphCache(device)
         self._wall_s = wall_s
-        self._as_one = as_one
+        self._single_graph = single_graph
         self._waiting: list[Launches] | None = None
-        """Launches of the batch that is launched as one; None: there is none."""
+        """Launches of the batch that becomes one graph; None outside such a batch."""
         streams = in_flight > 1  # with one batch in flight nothing overlaps
         self._flight_stream = make_stream(device, high_priority=True) if streams else None
-        # of each batch in flight: the last rays of one and the first of the next fill the device together
+        # one per batch in flight: the last rays of one and the first of the next fill the device together
         self._render_streams = [make_stream(device) if streams else None for _ in range(in_flight)]
         self._scan_stream = make_stream(device, high_priority=True) if streams else None
-        self._choice_stream = make_stream(device, high_priority=True) if streams and chooses else None
-        self._flown = [Fence(device) for _ in range(flown_ahead)]
+        self._choice_stream = make_stream(device, high_priority=True) if streams and adaptive else None
+        self._flight_done = [Fence(device) for _ in range(flown_ahead)]
         self._rendered = Fence(device)
         self._done = [Fence(device) for _ in range(in_flight)]
 
     def run(self, launches: Launches) -> None:
-        """Launch in a stage; in a batch that is launched as one, at its end."""
+        """Launch in a stage, or at the end of the batch if the batch becomes one graph."""
         if self._waiting is None:
             self.graphs.run(*launches)
         else:
             self._waiting.append(launches)
 
     def batch(self, number: int) -> AbstractContextManager[None]:
-        """Launch all stages of a batch."""
-        return self._whole(number) if self._as_one else nullcontext()
+        """Return the context in which all stages of a batch are launched."""
+        return self._whole(number) if self._single_graph else nullcontext()
 
     @contextmanager
     def _whole(self, number: int) -> Iterator[None]:
@@ -77,26 +77,27 @@ class Pipeline:
             waiting, self._waiting = self._waiting, None
         with timed(self._wall_s, "launches"):
             self.graphs.run_all(waiting)
-            self._flown[number % self.flown_ahead].set()
+            self._flight_done[number % self.flown_ahead].set()
             self._done[number % self.in_flight].set()
 
     def flight(self, number: int) -> AbstractContextManager[None]:
-        """Launch the flight of a batch."""
-        end = self._flown[number % self.flown_ahead]
+        """Return the context in which the flight of a batch is launched."""
+        end = self._flight_done[number % self.flown_ahead]
         return self._stage("dynamics and control", self._flight_stream, None, end)
 
     def choice(self, number: int) -> AbstractContextManager[None]:
-        """Find what is rendered of a batch that flies, ahead of the renderers."""
-        flown = self._flown[number % self.flown_ahead]
+        """Return the context in which the instants to render are chosen, ahead of the renders."""
+        flown = self._flight_done[number % self.flown_ahead]
         return self._stage("choice of renders", self._choice_stream, flown, None)
 
     def renders(self, number: int) -> AbstractContextManager[None]:
-        """Launch the renders of a batch whose flight was launched."""
-        flown, stream = self._flown[number % self.flown_ahead], self._render_streams[number % self.in_flight]
+        """Return the context in which the renders of a batch are launched, after its flight."""
+        flown = self._flight_done[number % self.flown_ahead]
+        stream = self._render_streams[number % self.in_flight]
         return self._stage("render", stream, flown, self._rendered)
 
     def scans(self, number: int) -> AbstractContextManager[None]:
-        """Launch the scans of the frames that were rendered last; that is the end of the batch."""
+        """Return the context in which the last rendered frames are scanned, the last stage of a batch."""
         end = self._done[number % self.in_flight]
         return self._stage("events", self._scan_stream, self._rendered, end)
 
@@ -107,9 +108,9 @@ class Pipeline:
             after = end = None
         return _Stage(self._wall_s, phase, stream, after, end)
 
-    def wait_flown(self, number: int) -> None:
+    def wait_flight(self, number: int) -> None:
         """Wait for the flight of a batch."""
-        self._flown[number % self.flown_ahead].wait()
+        self._flight_done[number % self.flown_ahead].wait()
 
     def wait(self, number: int) -> None:
         """Wait for the end of a batch."""
@@ -122,7 +123,7 @@ class Pipeline:
 
 
 class _Stage(timed):
-    """Launches a block on a stream (None: the current one), behind a fence, and sets another at its end."""
+    """Runs a block on a stream (None: the current one), between a fence to wait for and one to set."""
 
     __slots__ = ("_after", "_end", "_on")
 

@@ -7,16 +7,16 @@ from neurosim_core.settings import BaseConfig
 
 
 class SceneConfig(BaseConfig):
-    """Settings of a scene. A kind adds its `kind`, what it needs, and `load`."""
+    """Base class of the settings of scenes. Subclasses add `kind`, their fields, and `load`."""
 
     kind: str
-    """Under which name the class is registered."""
+    """Name under which the class is registered."""
 
     def load(self, *, pictures: bool = True) -> Scene:
         """Generate or read the scene.
 
         Args:
-            pictures: Decode the textures of a file now, or when they are first looked at, if ever.
+            pictures: Decode the textures of a file now; else at their first use.
 
         Raises:
             SceneError: A file cannot be used.

@@ -31,7 +31,7 @@ def extent(points: NDArray[Any]) -> NDArray[Any]:
 
 
 class Texture:
-    """A picture that is wrapped around a surface; painted when it is first looked at, if ever."""
+    """A texture; a generated one is painted at its first use."""
 
     def __init__(
         self,

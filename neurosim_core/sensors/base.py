@@ -1,10 +1,12 @@
 """The interface of sensors: a sensor is one file that registers one subclass of these classes.
 
-A *state sensor* (IMU, odometry) reads the state of the vehicles at its stamps: its config makes a `Sampler`.
-An *image sensor* (RGB, depth) takes a picture that the renderer has computed: its config names the output of
-the renderer, and turns the picture into a packet. A *frame sensor* (the event camera) sees every instant that
-is rendered for it: its config makes a `FrameSensor`. The engine asks for nothing else, and never which sensor
-it is.
+- A *state sensor* (IMU, odometry) reads the state of the vehicles at its stamps. Its config makes a
+  `Sampler`.
+- An *image sensor* (RGB, depth) takes pictures. Its config names an output of the renderer, and makes a
+  packet of a picture.
+- A *frame sensor* (the event camera) processes every rendered instant. Its config makes a `FrameSensor`.
+
+The engine uses these interfaces only, and has no code for a particular sensor.
 """
 
 from __future__ import annotations
@@ -35,26 +37,26 @@ class RenderRequest(NamedTuple):
     """The request of a camera to the renderer."""
 
     outputs: frozenset[str]
-    """Some of `render.outputs.OUTPUTS`."""
+    """Render outputs, a subset of `render.outputs.OUTPUTS`."""
     rate_hz: float
-    """Frequency [Hz]."""
+    """Render rate [Hz]."""
     every_instant: bool = False
-    """It has to see all instants that are rendered in its group, in order; its rate is that of the group."""
+    """The camera processes all rendered instants of its group, in order; its rate is that of the group."""
     max_displacement_px: float | None = None
-    """Adaptive sampling: an instant is rendered only where something would move further than this [px]."""
+    """Adaptive sampling: skip an instant as long as no point has moved further than this [px]."""
     required: Rate | None = None
-    """Ticks that are rendered in any case."""
+    """Ticks that adaptive sampling never skips."""
 
 
 class SensorConfig(BaseConfig):
     """Settings of a sensor. Subclasses add `kind: Literal["..."]` and are registered under that kind."""
 
     packet_type: ClassVar[type[Packet]]
-    """Class of its packets, whatever its settings; `packet_class` may say more."""
+    """Class of its packets; `packet_class` may return a subclass for some settings."""
     is_overlay: ClassVar[bool] = False
     """A viewer draws its pictures over those of a colour camera with the same view."""
     reported: ClassVar[Mapping[str, Callable[[Any], str]]] = {}
-    """What the report of a flight says of its settings, by the title of the row."""
+    """Rows of the flight report: title -> function that describes the settings."""
 
     if TYPE_CHECKING:
         kind: str
@@ -62,16 +64,16 @@ class SensorConfig(BaseConfig):
 
     @classmethod
     def check_class(cls) -> None:
-        """Check what all sensors have, when the class is registered.
+        """Check the class when it is registered.
 
         Raises:
-            TypeError: Its packets are not said, or cannot be recorded or sent; or it has no rate.
+            TypeError: It has no packet type or no rate, or its packets cannot be recorded or sent.
         """
         packet = getattr(cls, "packet_type", None)
         if not (isinstance(packet, type) and issubclass(packet, Packet)):
             raise TypeError(
-                f"{cls.__qualname__} must say the class of its packets, a subclass of ns.Packet: "
-                f"packet_type = ..., got {packet!r}"
+                f"{cls.__qualname__}.packet_type must be a subclass of ns.Packet, got {packet!r}: add "
+                "`packet_type = MyPacket`"
             )
         loose = [field.name for field in schema_of(packet).fields if "..." in field.shape]
         if loose and packet is not Image:
@@ -84,12 +86,12 @@ class SensorConfig(BaseConfig):
 
     @property
     def clock(self) -> Rate:
-        """When it samples."""
+        """Clock of its samples."""
         return Rate(self.rate_hz)  # type: ignore[attr-defined]
 
     @property
     def packets(self) -> Rate:
-        """When its packets come."""
+        """Clock of its packets."""
         return self.clock
 
     @property
@@ -100,28 +102,28 @@ class SensorConfig(BaseConfig):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SamplerContext:
-    """The context that a state sensor is made in."""
+    """Arguments of `StateSensorConfig.make`."""
 
     name: str
-    """Its name in the settings; two sensors with different names have independent noise."""
+    """Name of the sensor in the settings; sensors with different names have independent noise."""
     vehicle: Multirotor
     """The vehicles of all worlds."""
     slot_count: int
-    """Number of samples that its arrays hold."""
+    """Number of samples that the sampler's arrays must hold."""
     seeds: Any
     """Seed of each world, device array of uint64, shape [world]."""
     active: Any
-    """0 where a world is not measured, device array of int32, shape [world]."""
+    """0 for worlds that are not measured, device array of int32, shape [world]."""
     surfaces: Any = None
     """The surfaces that vehicles can touch (`sim.trace.Surfaces`)."""
 
 
 class Sampler(ABC):
-    """A state sensor at work, in all worlds.
+    """A state sensor in all worlds, made by its config.
 
     Attributes:
-        terms: What is computed beyond what every such sensor needs.
-        arrays: What it measures, by name: device arrays of shape [slot, world, ...].
+        terms: Names of optional terms that it computes, such as noise; for the flight report.
+        arrays: Its measurements by name, device arrays of shape [slot, world, ...].
     """
 
     terms: tuple[str, ...] = ()
@@ -129,79 +131,82 @@ class Sampler(ABC):
 
     @abstractmethod
     def measure(self, slot: int) -> None:
-        """Measure all vehicles at their present state; launches only.
+        """Measure all vehicles at their present state; only launch kernels and copies, do not wait.
 
         Args:
-            slot: Index into the first axis of `arrays` that the sample is written to.
+            slot: Index of the sample in the first axis of `arrays`.
         """
 
     @abstractmethod
     def packet(self, rows: Mapping[str, NDArray[Any]], **header: Any) -> Packet | None:
-        """Return one sample of one world as a packet; None: it is lost, and the sequence shows the gap.
+        """Return one sample of one world as a packet. None: the sample is lost, a gap in `sequence`.
 
         Args:
-            rows: The sample's element of each of `arrays`, by name, on the host: shape [...] of [slot, world,
-                ...].
-            header: `stamp_ns`, `sequence` and `sensor`, which the packet passes on.
+            rows: The sample in each of `arrays`, by name, on the host: shape [...] of [slot, world, ...].
+            header: `stamp_ns`, `sequence` and `sensor`; pass them to the packet.
         """
 
     def reset(self, mask: Any) -> None:  # noqa: B027  (most sensors have no memory)
-        """Begin anew in some worlds; launches only.
+        """Reset the memory of the sensor in some worlds; only launch kernels and copies, do not wait.
 
         Args:
-            mask: Not 0 where a world begins anew, device array of int32, shape [world].
+            mask: Not 0 for worlds that are reset, device array of int32, shape [world].
         """
 
 
 class StateSensorConfig(SensorConfig):
-    """A sensor that reads the state of the vehicle."""
+    """Settings of a sensor that reads the state of the vehicle."""
 
     def make(self, context: SamplerContext) -> Sampler:
-        """Return the sensor at work."""
-        raise NotImplementedError(f"{type(self).__name__} must say how it is made")
+        """Return the sampler for all worlds."""
+        raise NotImplementedError(
+            f"{type(self).__name__} must define `make(context)`, which returns a Sampler"
+        )
 
 
 class StereoConfig(BaseConfig):
-    """A second camera beside the first."""
+    """Settings of a stereo pair."""
 
     baseline_m: Annotated[float, Field(gt=0.0)]
     """Distance from the left camera to the right one [m], along a row of the picture."""
 
 
 class RenderedConfig(SensorConfig):
-    """A sensor that casts rays from a place on the body."""
+    """Settings of a sensor that casts rays from a mount on the body."""
 
     mount: Mount = Mount(position_m=(0.1, 0.0, 0.03))
     """Pose of the camera on the body."""
 
     @property
     def optics(self) -> Lens:
-        """Which ways its rays go."""
-        raise NotImplementedError(f"{type(self).__name__} must say where it looks")
+        """Directions of its rays."""
+        raise NotImplementedError(f"{type(self).__name__} must define the property `optics`, a lens")
 
     @property
     def timing(self) -> RayTiming | None:
-        """When its rays are cast; None: all at the stamp."""
+        """Times of its rays relative to the stamp; None: all are cast at the stamp."""
         return None
 
     @property
     def look_back_ns(self) -> int:
-        """Time before the end of a batch for which it needs the motion of the vehicle [ns]."""
+        """Length of the motion history that it needs before the end of a batch [ns]."""
         return 0
 
     def render_request(self) -> RenderRequest:
-        """Return what it asks of the renderer."""
-        raise NotImplementedError(f"{type(self).__name__} must say what is rendered for it")
+        """Return its request to the renderer."""
+        raise NotImplementedError(
+            f"{type(self).__name__} must define `render_request()`, which returns a RenderRequest"
+        )
 
 
 class CameraConfig(RenderedConfig):
-    """Settings that all cameras have: a lens and a place on the body."""
+    """Settings of all cameras: a lens and a mount on the body."""
 
     lens: AnyLens = PinholeConfig(width=346, height=260, horizontal_fov_rad=1.5)
     """Resolution and field of view: {kind: pinhole | radtan | rational | equidistant | double_sphere |
     ray_table, ...}, a pinhole if no kind is given."""
     stereo: StereoConfig | None = None
-    """Makes two cameras of one, NAME_left where it is mounted, and NAME_right: {baseline_m: 0.12}."""
+    """Replaces the camera NAME by two: NAME_left at the mount, and NAME_right: {baseline_m: 0.12}."""
 
     @property
     def optics(self) -> Lens:
@@ -211,120 +216,121 @@ class CameraConfig(RenderedConfig):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PictureContext:
-    """The context that the processing of the pictures of one sensor is made in."""
+    """Arguments of `PictureSensorConfig.make_process` and `constants`."""
 
     name: str
-    """Its name in the settings; two sensors with different names have independent noise."""
+    """Name of the sensor in the settings; sensors with different names have independent noise."""
     source: Any
-    """Pictures that the renderer writes, device array, shape [M, H, W, ...]; M image slots."""
+    """Pictures that the renderer writes for `output`, device array, shape [M, H, W, ...]; M image slots."""
     sources: Mapping[str, Any]
-    """The same for all outputs that the sensor asks for, by name."""
+    """The same for each name in `outputs`."""
     lenses: Sequence[Lens]
-    """The lenses there are, all of one size."""
+    """Lenses of the camera, all of one size."""
     lens_of_world: Any
-    """Index into them of each world, device array of int32, shape [N]."""
+    """Index of the lens of each world, device array of int32, shape [N]."""
     scenes: Sequence[Any]
-    """The scenes as the renderer has them."""
+    """The scenes in the form that the renderer keeps."""
     scene_of_world: Any
-    """Index into them of each world, device array of int32, shape [N]."""
+    """Index of the scene of each world, device array of int32, shape [N]."""
     motions: Any
-    """Of the bodies, device array of `scene.bodies.Motion`; None: there are none."""
+    """Motions of the bodies, device array of `scene.bodies.Motion`; None: there are no bodies."""
     times: RayTimes | None
-    """When its rays are cast; None: all at the stamp."""
+    """Times of its rays relative to the stamp; None: all are cast at the stamp."""
     stride: int
-    """K, the most instants of a world in one batch."""
+    """K, the largest number of instants of a world in one batch."""
     seeds: Any
     """Seed of each world, device array of uint64, shape [N]."""
 
 
 class PictureViews(NamedTuple):
-    """From where and when the pictures of a batch were taken; device arrays, rows are [world, K] in order."""
+    """Camera poses and times of the pictures of a batch; device arrays with rows in the order [world, K]."""
 
     instant_count: int
-    """Number of the K instants of each world that were rendered."""
+    """Number of rendered instants of each world, at most K."""
     image_slot: Any
-    """Slot of the picture of an instant, int32, shape [N K]; -1: there is none."""
+    """Image slot of each instant, int32, shape [N K]; -1: no picture."""
     p_WC: Any
-    """Position of the camera [m], vec3, shape [N K J], for the J times of its rays (1: the stamp)."""
+    """Position of the camera [m], vec3, shape [N K J]; J is the number of ray times (1: the stamp)."""
     q_WC: Any
-    """Orientation, likewise."""
+    """Orientation of the camera, xyzw, quat, same shape."""
     stamps: Any
-    """Times [ns], int64, shape [N K J, 1]."""
+    """Times of the poses [ns], int64, shape [N K J, 1]."""
     active: Any
-    """0 where a world is not rendered, int32, shape [N]; None: all are."""
+    """0 for worlds that are not rendered, int32, shape [N]; None: all worlds are rendered."""
     bodies: Any
-    """Poses of bodies at these times, `scene.bodies.BodyPoses`; None: there are none."""
-    look: Callable[..., None]
-    """Writes these poses at other times: of the offsets from the stamp [ns], int64, shape [J], not before
-    `RenderedConfig.look_back_ns`; `p_WC`, `q_WC`, `stamps` and `bodies` are overwritten."""
-    find_twists: Callable[[Any], None]
-    """Writes velocities of the camera in W [m/s] and angular in C [rad/s] at the stamps, to an array of
-    spatial_vectord, shape [N K]."""
+    """Poses of bodies at these times, `scene.bodies.BodyPoses`; None: there are no bodies."""
+    compute_poses: Callable[..., None]
+    """Computes poses at other times. Its argument is an array of offsets from the stamp [ns], int64, shape
+    [J], within `RenderedConfig.look_back_ns`; it overwrites the arrays given as keywords `p_WC`, `q_WC`,
+    `stamps` and `bodies`."""
+    compute_twists: Callable[[Any], None]
+    """Computes velocities of the camera at the stamps, linear in W [m/s] and angular in C [rad/s], into a
+    device array of spatial_vectord, shape [N K]."""
 
 
 class PictureProcess(Protocol):
-    """Turns the rendered pictures into those of the sensor: adds noise, for example.
+    """Processing of rendered pictures on the device, such as noise.
 
-    Its pictures are those of an output that has image slots. What it draws is addressed by the stamp.
+    It needs an output with image slots. Random numbers are addressed by the stamp.
     """
 
     terms: tuple[str, ...]
-    """Optional terms that it computes."""
+    """Names of optional terms that it computes; for the flight report."""
     picture: Any
-    """Pictures that it makes, device array, shape [M, H, W, ...]."""
+    """Pictures that it writes, device array, shape [M, H, W, ...]."""
 
     def launch(self, views: PictureViews) -> None:
-        """Process the pictures of a batch that was just rendered; launches only."""
+        """Process the pictures of a batch; only launch kernels and copies, do not wait."""
 
 
 class PictureSensorConfig(RenderedConfig):
-    """A sensor whose packet is made of one picture of one output of the renderer."""
+    """Settings of a sensor that makes each packet from one picture of a render output."""
 
     rate_hz: RateHz = 20.0
     """Pictures a second [Hz]."""
 
     output: ClassVar[str]
-    """The rendered quantity, one of `render.outputs.OUTPUTS`."""
+    """Name of the render output, one of `render.outputs.OUTPUTS`."""
 
     @property
     def outputs(self) -> frozenset[str]:
-        """All outputs that its pictures are made of."""
+        """Names of all render outputs that it needs."""
         return frozenset([self.output])
 
     def render_request(self) -> RenderRequest:
-        """Return what it asks of the renderer."""
+        """Return its request to the renderer."""
         return RenderRequest(outputs=self.outputs, rate_hz=self.rate_hz)
 
     @property
     def remembers(self) -> bool:
-        """Whether a picture depends on those before: then one batch is rendered after the other."""
+        """Whether a picture depends on earlier pictures; batches are then rendered one after the other."""
         return False
 
     def constants(self, context: PictureContext) -> Mapping[str, Any]:
-        """Return fields that all its packets have, such as names of what is in the scene."""
+        """Return packet fields that are the same in all its packets, such as names of objects."""
         return {}
 
     def packet(self, picture: NDArray[Any], **header: Any) -> Packet:
         """Return a picture as a packet.
 
         Args:
-            picture: The output of the renderer, or what `make_process` makes of it, on the host, shape [H, W]
-                or [H, W, C]; the packet keeps it.
-            header: `stamp_ns`, `sequence` and `sensor`, which the packet passes on.
+            picture: The render output, or the picture of `make_process`, on the host, shape [H, W] or
+                [H, W, C]; the packet may keep it.
+            header: `stamp_ns`, `sequence` and `sensor`; pass them to the packet.
         """
-        raise NotImplementedError(f"{type(self).__name__} must say what its packets are")
+        raise NotImplementedError(f"{type(self).__name__} must define `packet(picture, **header)`")
 
     def make_process(self, context: PictureContext) -> PictureProcess | None:
-        """Return what its pictures go through on the device, before anyone has them; None: nothing."""
+        """Return the processing of its pictures on the device; None: none."""
         return None
 
 
 class ImageSensorConfig(CameraConfig, PictureSensorConfig):
-    """A camera that takes pictures of one output of the renderer."""
+    """Settings of a camera that takes pictures of one render output."""
 
     shutter: ShutterConfig = ShutterConfig()
-    """When lines are exposed: {readout_s: 0.02} rolls, {exposure_s: 0.005} blurs what moves; by default
-    all rays are cast at the stamp."""
+    """Exposure times of lines: {readout_s: 0.02} is a rolling shutter, {exposure_s: 0.005} blurs motion. By
+    default all rays are cast at the stamp."""
 
     packet_type: ClassVar[type[Packet]] = Image
     encoding: ClassVar[ImageEncoding]
@@ -341,30 +347,30 @@ class ImageSensorConfig(CameraConfig, PictureSensorConfig):
 
     @property
     def timing(self) -> RayTiming | None:
-        """The shutter, unless it is global and takes no time."""
+        """The shutter; None for a global shutter without exposure time."""
         return self.shutter if self.shutter.window_ns else None
 
     @property
     def packet_encoding(self) -> str:
-        """Encoding of its pictures with these settings: `encoding`, unless a sensor says another."""
+        """Encoding of its pictures with these settings; by default `encoding`."""
         return self.encoding
 
     def packet(self, picture: NDArray[Any], **header: Any) -> Packet:
-        """Return a picture as a packet, whose class has `data` and `encoding`; see `PictureSensorConfig`."""
+        """Return a packet with the fields `data` and `encoding`; see `PictureSensorConfig.packet`."""
         packet: Packet = self.packet_class(data=picture, encoding=self.packet_encoding, **header)  # type: ignore[call-arg]
         return packet
 
 
 class FrameSensor(ABC):
-    """A frame sensor at work in all worlds: it sees every instant that is rendered for it.
+    """A frame sensor in all worlds, made by its config. It processes every rendered instant.
 
-    What it makes of the frames stays on the device, in `results`, or goes to the host as packets: the context
-    says which is wanted (`FrameContext.on_host`). Frames come batch by batch: `plan` for each, and where
-    there are packets `begin_read` for the oldest one that was not read.
+    With `FrameContext.on_host`, its results go to the host as packets; else they stay on the device in
+    `results`. The engine calls `plan` for each batch and, for packets, `begin_read` for the oldest batch that
+    was not read.
 
     Attributes:
-        terms: What is computed beyond what every such sensor needs.
-        results: What it found in the last batch, on the device.
+        terms: Names of optional terms that it computes, such as noise; for the flight report.
+        results: Results of the last batch, on the device.
     """
 
     terms: tuple[str, ...] = ()
@@ -375,106 +381,112 @@ class FrameSensor(ABC):
         """Take the first frame of each world as its reference.
 
         Args:
-            frames: As of `plan`.
+            frames: See `plan`.
             stamp_ns: Time of the first frame [ns].
-            mask: Not 0 where a world begins, device array of int32, shape [N].
+            mask: Not 0 for worlds that take a new reference, device array of int32, shape [N].
         """
 
     @abstractmethod
     def plan(self, frames: Any, stamps_ns: Sequence[int], end_ns: int) -> Launches | None:
-        """Return what makes something of the frames of a batch; None: nothing is to be done.
+        """Return the launches that process the frames of a batch; None: there is nothing to do.
 
-        Keys of launches tell those of this sensor apart; other sensors may have the same.
+        Keys of launches must be unique within this sensor.
 
         Args:
-            frames: Log radiance, device array of float32, shape [N K, H, W]; stays as it is until the batch
-                has been read. It is there when the launches run.
-            stamps_ns: Times of the first frames of each world [ns], at most K, increasing. There may be none,
-                in a run also before `begin`.
+            frames: Log radiance, device array of float32, shape [N K, H, W]. It is written before the
+                launches run, and valid until the batch has been read.
+            stamps_ns: Times of the valid frames of each world [ns], at most K, increasing. The list may be
+                empty, also before the first `begin`.
             end_ns: End of the batch [ns].
         """
 
     def begin_read(self, stamps_ns: Sequence[int], *, until_ns: int) -> Callable[[], list[Packet]]:
-        """Wait for the oldest batch; return the function that returns the packets that end in it.
+        """Wait for the oldest batch; return a function that returns its packets.
 
-        That function is called next, or after the launches of one more batch.
+        The engine calls that function next, or after the launches of one more batch.
 
         Args:
             stamps_ns: Times of the frames of the batch [ns].
-            until_ns: Packets that end later are not returned [ns].
+            until_ns: Last stamp of packets to return [ns].
         """
         raise NotImplementedError(f"{type(self).__name__} has no packets: its results stay on the device")
 
     def flush(self, *, until_ns: int) -> list[Packet]:
-        """Return the packet that has begun and not ended, cut at a stamp [ns]."""
+        """Return the packet of the open window, cut at a stamp [ns]; for the end of a run."""
         return []
 
     def seed(self, seeds: Sequence[int], worlds: Collection[int] | None = None) -> None:
-        """Draw what stays in the pixels of some worlds anew; waits for the device.
+        """Draw the constant noise of the pixels of some worlds again; waits for the device.
 
         Args:
-            seeds: Seed of each world, of all N.
-            worlds: Indices of the worlds whose pixels are drawn; None: all.
+            seeds: Seed of each of the N worlds.
+            worlds: Indices of the worlds to draw; None: all.
         """
         if self.terms:
-            raise NotImplementedError(f"{type(self).__name__} cannot draw its noise anew")
+            raise NotImplementedError(
+                f"{type(self).__name__} has noise and must define `seed(seeds, worlds)` to take new seeds"
+            )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FrameContext:
-    """The context that a frame sensor is made in."""
+    """Arguments of `FrameSensorConfig.make`."""
 
     name: str
-    """Its name in the settings; two sensors with different names have independent noise."""
+    """Name of the sensor in the settings; sensors with different names have independent noise."""
     configs: Sequence[Any]
-    """Its settings in each world."""
+    """Settings of the sensor in each world."""
     lens: Lens
+    """Lens of the camera."""
     device: str
+    """Warp device."""
     on_host: bool
-    """There is one world, and packets of it are wanted; else results stay on the device."""
+    """The sensor returns packets of one world; else its results stay on the device."""
     in_flight: int
-    """The most batches that it has seen and that were not read."""
+    """Largest number of batches that are launched and not read."""
     instant_count: int
-    """K, the most frames of a world in one batch."""
+    """K, the largest number of frames of a world in one batch."""
     capacity: int
-    """Room for results of one world in one batch (`FrameSensorConfig.world_capacity`)."""
+    """Capacity for results of one world in one batch (`FrameSensorConfig.world_capacity`)."""
     ordered: bool
     """Sort the results of each world."""
     seeds: Sequence[int]
-    """Of each world."""
+    """Seed of each world."""
     clock_ns: Any
     """Time of each world at the end of the batch [ns], device array of int64, shape [N]."""
     scene: Any
-    """As the renderer has it."""
+    """The scene in the form that the renderer keeps."""
     motions: Any
-    """Of the bodies, device array of `scene.bodies.Motion`; None: there are none."""
+    """Motions of the bodies, device array of `scene.bodies.Motion`; None: there are no bodies."""
     history: Any
-    """The flight, as far back as `look_back_ns` says (`vehicle.history.History`)."""
+    """Motion history of length `look_back_ns` (`vehicle.history.History`)."""
     p_BC: Any
     """Position of the camera on the body [m], vec3d."""
     q_BC: Any
-    """Orientation of the camera against the body, quatd."""
+    """Orientation of the camera on the body, quatd."""
 
 
 class FrameSensorConfig(CameraConfig):
-    """A camera that sees every instant that is rendered for it."""
+    """Settings of a camera that processes every rendered instant."""
 
     def world_capacity(self, world_count: int, event_capacity: int | None) -> int:
-        """Return for how many results of each world there is room in a batch.
+        """Return the capacity for results of each world in a batch.
 
         Args:
             world_count: Number of worlds N.
-            event_capacity: What the user asks for; None: as the sensor likes.
+            event_capacity: Capacity that the user asks for; None: the sensor's own choice.
 
         Raises:
-            ValueError: They are more than can be counted.
+            ValueError: The capacity of all worlds is too large.
         """
         return event_capacity or 0
 
     def make(self, context: FrameContext) -> FrameSensor:
-        """Return the sensor at work.
+        """Return the frame sensor for all worlds.
 
         Raises:
-            ValueError: It cannot be in many worlds, or in one; the message says why.
+            ValueError: The sensor or its settings do not support many worlds; the message says why.
         """
-        raise NotImplementedError(f"{type(self).__name__} must say how it is made")
+        raise NotImplementedError(
+            f"{type(self).__name__} must define `make(context)`, which returns a FrameSensor"
+        )

@@ -1,4 +1,4 @@
-"""The event camera as a sensor of a vehicle: what is rendered for it, and when its packets end."""
+"""The event camera as a sensor: its settings, its request to the renderer, and its packets."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 EventLabel = Literal["depth", "flow", "instance", "semantic", "cause"]
 
 _ROOM_MIN = 1024
-"""Events of one world in one step for which there is room at least."""
+"""Smallest default capacity for the events of one world in one step."""
 _INDEX_MAX = 2**31 - 1
-"""Events of all worlds are counted in 32 bits."""
+"""Largest number of events of all worlds; indices have 32 bits."""
 
 
 @register("sensor", "event_camera")
@@ -43,22 +43,22 @@ class EventSensorConfig(FrameSensorConfig):
 
     kind: Literal["event_camera"] = "event_camera"
     pixel: EventCameraConfig = EventCameraConfig()
-    """The law of its pixels."""
+    """Model of its pixels."""
     sampling_rate_hz: RateHz = 500.0
-    """How often log radiance is rendered [Hz]; between two renders it is taken as linear in time."""
+    """Rate at which log radiance is rendered [Hz]; it is linear in time between two renders."""
     max_displacement_px: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
-    """Adaptive sampling: a tick of the sampling rate is rendered only if without it some point would have
-    moved further than this between two renders [px]; ends of packets are always rendered. `sampling_rate_hz`
-    is then the finest step, and may be high, such as 10000. null: every tick is rendered."""
+    """Adaptive sampling: a tick of the sampling rate is rendered only if some point would otherwise move
+    further than this between two renders [px]; ends of packets are always rendered. `sampling_rate_hz` is
+    then the highest render rate, and may be high, such as 10000. null: every tick is rendered."""
     packet_rate_hz: RateHz | None = None
-    """How many packets of events are sent a second [Hz]; each holds the events of its whole window. null: the
-    highest rate up to 100 Hz that divides the sampling rate."""
+    """Rate of packets [Hz]; each packet holds the events of its whole window. null: the highest rate up to
+    100 Hz that divides the sampling rate."""
 
     labels: tuple[EventLabel, ...] = ()
-    """The truth of each event, beside t, x, y and polarity: [depth, flow, instance, semantic, cause], some of
-    them; see `sensors/event_labels.py`. Empty: none is computed."""
+    """Ground truth of each event, beside t, x, y and polarity: any of [depth, flow, instance, semantic,
+    cause]; see `sensors/event_labels.py`. Empty: none."""
     classes: dict[str, tuple[str, ...]] | None = None
-    """With the label `semantic`: patterns of names by class, as of a `semantic` camera."""
+    """For the label `semantic`: name patterns by class, as for a `semantic` camera."""
 
     packet_type = Events
     reported: ClassVar[Any] = {"pixels": lambda sensor: describe_pixel(sensor.pixel)}
@@ -66,12 +66,12 @@ class EventSensorConfig(FrameSensorConfig):
     @model_validator(mode="after")
     def _classes_are_labels(self) -> EventSensorConfig:
         if self.classes is not None and "semantic" not in self.labels:
-            raise ValueError(f"classes are for the label semantic, got labels {list(self.labels)}")
+            raise ValueError(f"classes need the label semantic, got labels {list(self.labels)}")
         return self
 
     @property
     def packet_class(self) -> type[Events]:
-        """With labels, events that have them."""
+        """`LabelledEvents` with labels, else `Events`."""
         if not self.labels:
             return Events
         from neurosim_core.sensors.event_labels import LabelledEvents
@@ -80,19 +80,19 @@ class EventSensorConfig(FrameSensorConfig):
 
     @property
     def look_back_ns(self) -> int:
-        """Over the events of a packet, and of the batch that it ends in."""
+        """Length of the motion history for labels [ns]: one packet and one sampling period."""
         if not set(self.labels) - {"cause"}:
             return 0
         return math.ceil(1e9 * (1.0 / self.packets.rate_hz + 1.0 / self.sampling_rate_hz))
 
     @property
     def clock(self) -> Rate:
-        """When log radiance is rendered for it."""
+        """Clock at which log radiance is rendered."""
         return Rate(self.sampling_rate_hz)
 
     @property
     def packets(self) -> Rate:
-        """The clock at which packets end."""
+        """Clock at which packets end."""
         if self.packet_rate_hz is not None:
             return Rate(self.packet_rate_hz)
         sampling = Fraction(str(self.sampling_rate_hz))
@@ -100,7 +100,7 @@ class EventSensorConfig(FrameSensorConfig):
         return Rate(float(next(share for share in shares if Fraction(str(float(share))) == share)))
 
     def render_request(self) -> RenderRequest:
-        """Return what it asks of the renderer."""
+        """Return its request to the renderer."""
         adaptive = self.max_displacement_px is not None
         return RenderRequest(
             outputs=frozenset(["log_radiance"]),
@@ -111,27 +111,27 @@ class EventSensorConfig(FrameSensorConfig):
         )
 
     def world_capacity(self, world_count: int, event_capacity: int | None) -> int:
-        """Return for how many events of each world there is room in a step."""
+        """Return the capacity for events of each world in a step."""
         capacity = event_capacity or max(_ROOM_MIN, 2 * self.lens.width * self.lens.height)
         if world_count * capacity > _INDEX_MAX:
             raise ValueError(
-                f"{world_count} worlds with room for {capacity} events each are more than 2^31: give a "
-                f"smaller event_capacity, at most {_INDEX_MAX // world_count}, or take fewer worlds"
+                f"{world_count} worlds with a capacity of {capacity} events each exceed 2^31 events: give an "
+                f"event_capacity of at most {_INDEX_MAX // world_count}, or fewer worlds"
             )
         return capacity
 
     def make(self, context: FrameContext) -> FrameSensor:
-        """Return the camera at work: with packets, or with results of all worlds."""
+        """Return the camera of one world with packets, or the cameras of all worlds."""
         if context.on_host:
             return EventChannel(self, context)
         if self.labels:
             raise ValueError(
-                f"labels of {context.name!r} are for single runs: packets have them, on the host"
+                f"labels of {context.name!r} are for single runs only: they are part of packets on the host"
             )
         pixels = [config.pixel for config in context.configs]
         if any(pixel.readout is not None for pixel in pixels):
             raise ValueError(
-                f"readout of {context.name!r} is for single runs: events wait for each other on the host"
+                f"readout of {context.name!r} is for single runs only: the arbiter runs on the host"
             )
         return WorldEventCamera(
             pixels,
@@ -195,34 +195,34 @@ class EventChannel(FrameSensor):
         self._seen_ns = 0
 
     def begin(self, frames: Any, stamp_ns: int, mask: Any) -> None:
-        """Take the first frame as the reference; waits for it."""
+        """Take the first frame as the reference; waits for the device."""
         self._camera.reset(frames[0], stamp_ns, sequence=self._sequence)
 
     def plan(self, frames: Any, stamps_ns: Sequence[int], end_ns: int) -> Launches | None:
-        """Return what scans the instants of a batch; the camera records it itself."""
+        """Return the scan of the instants of a batch, without a key: the camera records its own graphs."""
         if not stamps_ns:
             return None
 
         def scan() -> None:
             if self._labels is not None:
-                self._labels.note_flown()
+                self._labels.record_flight()
             self._camera.feed_device(frames, stamps_ns)
 
         return Launches(None, scan)
 
     def begin_read(self, stamps_ns: Sequence[int], *, until_ns: int) -> Callable[[], list[Packet]]:
-        """Wait for the oldest batch; return what gives the packets whose windows end in it."""
-        begun_ns = self._camera.window_start_ns
+        """Wait for the oldest batch; return a function that returns the packets whose windows end in it."""
+        start_ns = self._camera.window_start_ns
         ticks = self._packets.stamps(stamps_ns[0], stamps_ns[-1] + 1)
-        ends = [tick for tick in ticks if tick in stamps_ns and begun_ns < tick <= until_ns]
-        fed = stamps_ns[-1] > self._camera.stamp_ns
+        ends = [tick for tick in ticks if tick in stamps_ns and start_ns < tick <= until_ns]
+        is_fed = stamps_ns[-1] > self._camera.stamp_ns
         self._seen_ns = max((stamp for stamp in stamps_ns if stamp <= until_ns), default=self._seen_ns)
-        hand_out = self._camera.begin_windows(ends, scan_count=int(fed))
+        collect = self._camera.begin_windows(ends, scan_count=int(is_fed))
         self._sequence += len(ends)
-        return lambda: self._labelled(hand_out())
+        return lambda: self._labelled(collect())
 
     def flush(self, *, until_ns: int) -> list[Packet]:
-        """Return the packet whose window has begun and not ended, cut at the last instant until a stamp."""
+        """Return the packet of the open window, cut at the last instant up to a stamp."""
         cut_ns = min(until_ns, self._seen_ns)
         if self._camera.window_start_ns >= cut_ns:
             return []

@@ -230,7 +230,7 @@ class EventLabels:
             meaning |= {"instances": known.instances[0], "classes": known.classes}
         return _make_kernel(getattr(lens, "kind", ""), self._geometry, scene.bodies is not None)
 
-    def note_flown(self) -> None:
+    def record_flight(self) -> None:
         """Note how far the flight is known; launches only.
 
         The vehicle may be ahead, and go on while `launch` looks back.

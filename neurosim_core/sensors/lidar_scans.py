@@ -41,7 +41,7 @@ class Scan(BaseConfig):
 
     def directions(self) -> NDArray[np.float64]:
         """Return azimuth and elevation of each ray [rad], shape [H, W, 2]."""
-        raise NotImplementedError(f"{type(self).__name__} must say where it looks")
+        raise NotImplementedError(f"{type(self).__name__} must define `directions()`")
 
     def fractions(self) -> NDArray[np.float64]:
         """Return when each ray is cast: from 0, the first ray, to 1, the last; shape [H, W]."""

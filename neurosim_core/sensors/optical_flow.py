@@ -335,9 +335,9 @@ class FlowProcess(PixelProcess):
     def launch(self, views: PictureViews) -> None:
         """Make the flow of the pictures of a batch; launches only."""
         if "velocity" in self.terms:
-            views.find_twists(self._model.twist)
+            views.compute_twists(self._model.twist)
         else:
-            views.look(self._offsets_ns, **self._there)
+            views.compute_poses(self._offsets_ns, **self._there)
             batch = self.batch_of(views)
             view_count = views.image_slot.shape[0] // batch.stride * views.instant_count
             inputs = [self._model, self._focal_px, batch]

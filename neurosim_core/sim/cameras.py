@@ -29,66 +29,62 @@ _SLOT_LISTS_MAX = 256
 
 @dataclass(kw_only=True, eq=False)
 class RenderJob:
-    """The instants of a batch that a group renders, at least one."""
+    """The instants of a batch that one group renders in one launch, at least one."""
 
     group: RenderGroupState
     buffers: BatchBuffers
-    """The arrays that are overwritten."""
+    """The arrays that the job overwrites."""
     trace: Trace
+    """The motion of the vehicles."""
     stamps_ns: Sequence[int]
     """Stamps of the instants, of the clock that all worlds share [ns]."""
     pictures: Sequence[tuple[int, int, str]]
     """Stamp, image slot and camera of each picture."""
     frames: Sequence[str]
-    """Frame sensors that see the instants."""
+    """Frame sensors that scan the instants."""
     pose_count: int
-    """Instants of which poses are computed."""
+    """Number of instants whose poses are computed."""
     image_count: int
-    """Image slots that are written."""
+    """Number of image slots that are written."""
     from_slots: wp.array[int]
-    """Slots of the trace, of the instants."""
+    """Slot of each instant in the trace."""
     to_slots: wp.array[int]
-    """Image slots of the instants of all worlds; -1: there is no picture."""
+    """Image slot of each instant of all worlds; -1: no picture."""
     active: Any
     """0 where a world is not rendered, device array of int32, shape [world]; None: all are."""
     pattern: Hashable | None
-    """Same pattern, same launches; None: they do not come again, or more than launches is done."""
+    """Key of the launches: equal patterns have equal launches. None: the launches cannot be recorded."""
     picture_buffers: dict[tuple[str, int], NDArray[Any]] = field(default_factory=dict)
-    """Buffers of the caller that pictures are copied to, by camera and stamp."""
+    """Buffers of the caller for pictures, by camera and stamp."""
 
 
-def _choose(model: Model, state: State, batch: Batch) -> list[list[int]]:
-    """Return which boundaries of a batch each group has to render; adaptive groups wait for the flight."""
-    chosen: list[list[int]] = []
+def _choose_boundaries(model: Model, state: State, batch: Batch) -> list[Sequence[int]]:
+    """Return the boundaries of a batch that each group renders; adaptive groups wait for the motion."""
+    chosen: list[Sequence[int]] = []
     for index, group in enumerate(state.groups):
-        group.watching &= batch.wanted
-        due = [
-            place
-            for place, boundary in enumerate(batch.boundaries)
-            if index in boundary.groups and is_due(group, boundary.stamp_ns, batch.wanted)
-        ]
+        due = due_places(group, batch, index)
         if group.rule is not None and due:
             with state.pipeline.choice(batch.number):
-                due = _choose_ticks(model, state, batch, group, due)
+                due = _choose_adaptive(model, state, batch, group, due)
         chosen.append(due)
     return chosen
 
 
-def _choose_ticks(
+def _choose_adaptive(
     model: Model, state: State, batch: Batch, group: RenderGroupState, due: Sequence[int]
 ) -> list[int]:
-    """Return which boundaries an adaptive group renders of those that are due; wait until that is known.
+    """Return the due boundaries that an adaptive group renders; waits for the motion of the batch.
 
-    These are the ticks that its rule asks for, the ends of the packets of its sensors, the last tick of the
-    run, and the first tick that a camera sees. The rule moves on to the end of the batch.
+    The group renders the ticks that its displacement rule chooses, the ends of the packets of its sensors,
+    the last tick of the run, and the first tick of a camera. The rule moves on to the end of the batch.
     """
     assert group.rule is not None
-    stamps_ns = [batch.boundaries[place].stamp_ns for place in due]
-    looking = [name for name in group.frames if name in batch.wanted]
-    required = [model.config.sensors[name].packets for name in looking]
+    stamps_ns = [batch.stamps_ns[place] for place in due]
+    enabled = [name for name in group.frames if name in batch.enabled_cameras]
+    required = [model.config.sensors[name].packets for name in enabled]
     last_ns = group.rate.stamp_ns(group.rate.first_tick(model.duration_ns + 1) - 1)
     forced = [s == last_ns or any(clock.has_tick(s) for clock in required) for s in stamps_ns]
-    forced[0] |= not group.watching.issuperset(looking)
+    forced[0] |= not group.referenced.issuperset(enabled)
     slots = [batch.slot + place for place in due]
     places = group.rule.choose(state.trace.arrays.states, slots, stamps_ns, forced)
     batch.left_out_count += len(due) - len(places)
@@ -96,53 +92,58 @@ def _choose_ticks(
     return [due[place] for place in places]
 
 
-def is_due(group: RenderGroupState, stamp_ns: int, wanted: Collection[str]) -> bool:
-    """Return whether a camera that is wanted sees the tick of a group."""
-    return any(name in wanted for name in group.frames) or bool(pictures_due(group, stamp_ns, wanted))
+def due_places(group: RenderGroupState, batch: Batch, index: int) -> Sequence[int]:
+    """Return the boundaries at which enabled cameras of a group are due; others lose their reference."""
+    group.referenced &= batch.enabled_cameras
+    places = batch.stretch.group_places.get(index, ())
+    if batch.enabled_cameras.isdisjoint(group.frames):  # a frame sensor needs every tick
+        places = [p for p in places if pictures_due(group, batch.stamps_ns[p], batch.enabled_cameras)]
+    return places
 
 
-def pictures_due(group: RenderGroupState, stamp_ns: int, wanted: Collection[str]) -> list[str]:
-    """Return the image sensors that are wanted and take a picture at a tick of a group."""
-    return [name for name, image in group.images.items() if name in wanted and image.rate.has_tick(stamp_ns)]
+def pictures_due(group: RenderGroupState, stamp_ns: int, enabled: Collection[str]) -> list[str]:
+    """Return the enabled image sensors that take a picture at a tick of a group."""
+    return [name for name, image in group.images.items() if name in enabled and image.rate.has_tick(stamp_ns)]
 
 
 def plan_jobs(model: Model, state: State, batch: Batch) -> Sequence[RenderJob]:
-    """Return what the groups render of a batch; if nothing is planned yet, that is done."""
+    """Return the renders of a batch, planned at the first call."""
     if batch.jobs is None:
-        chosen = _choose(model, state, batch)
+        chosen = _choose_boundaries(model, state, batch)
         batch.jobs = [plan_job(state, batch, index, places) for index, places in enumerate(chosen) if places]
     return batch.jobs
 
 
 def plan_ahead(model: Model, state: State, batch: Batch) -> None:
-    """Plan what is rendered of a batch that is going to be flown, unless that depends on the flight."""
+    """Plan the renders of a batch before it is launched, unless they depend on its motion."""
     if model.schedule.sparse or any(group.frames for group in state.groups):
         return
     plan_jobs(model, state, batch)
 
 
 def plan_job(state: State, batch: Batch, index: int, places: Sequence[int]) -> RenderJob:
-    """Return how a group renders some boundaries of a batch, at least one."""
+    """Return the job of a group that renders some boundaries of a batch, at least one."""
     group, buffer_index = state.groups[index], batch.number % state.pipeline.in_flight
     slots = tuple(batch.slot + place for place in places)
-    stamps_ns = [batch.boundaries[place].stamp_ns for place in places]
+    stamps_ns = [batch.stamps_ns[place] for place in places]
     pictures = []
-    image_slots = []
+    image_slots = [-1] * len(places)
     used = 0
-    for instant, stamp_ns in enumerate(stamps_ns):
-        due = pictures_due(group, stamp_ns, batch.wanted) if group.images else ()
+    for instant, stamp_ns in enumerate(stamps_ns if group.images else ()):
+        due = pictures_due(group, stamp_ns, batch.enabled_cameras)
         pictures += [
             (stamp_ns, instant if group.images[name].output in INSTANT_OUTPUTS else used, name)
             for name in due
         ]
-        image_slots.append(used if due else -1)
-        used += bool(due)
+        if due:
+            image_slots[instant] = used
+            used += 1
     posed, placed = slots, tuple(image_slots)
     pattern: Hashable | None = None
     if group.only_launches:
-        taken = tuple((slot, name) for _, slot, name in pictures)  # each has launches of its own
+        taken = tuple((slot, name) for _, slot, name in pictures)  # each picture has its own launches
         pattern = (id(group), buffer_index, posed, placed, taken)
-    if group.world_count > 1:  # frustum candidate lists look at all instants of a world
+    if group.world_count > 1:  # frustum candidate lists read the poses of all instants of a world
         posed += (slots[-1],) * (group.capacity - len(slots))
     buffers = group.buffers[buffer_index]
     if buffers.chosen_slots is None:
@@ -156,7 +157,7 @@ def plan_job(state: State, batch: Batch, index: int, places: Sequence[int]) -> R
         trace=state.trace,
         stamps_ns=stamps_ns,
         pictures=pictures,
-        frames=[name for name in group.frames if name in batch.wanted],
+        frames=[name for name in group.frames if name in batch.enabled_cameras],
         pose_count=len(posed),
         image_count=used,
         from_slots=from_slots,
@@ -167,7 +168,7 @@ def plan_job(state: State, batch: Batch, index: int, places: Sequence[int]) -> R
 
 
 def acquire_picture_buffers(job: RenderJob) -> None:
-    """Ask the caller for buffers for the pictures of a job that have none yet."""
+    """Ask the caller for buffers for those pictures of a job that have none yet."""
     if job.group.allocate_picture is None:
         return
     for stamp_ns, slot, name in job.pictures:
@@ -179,7 +180,7 @@ def acquire_picture_buffers(job: RenderJob) -> None:
 
 
 def launch_key(job: RenderJob) -> Hashable | None:
-    """Return the key of the launches of a job: they copy pictures to the buffers that there are now."""
+    """Return the key of the launches of a job, which includes the addresses of picture buffers."""
     if job.pattern is None or job.group.allocate_picture is None:
         return job.pattern
     places = (job.picture_buffers.get((name, stamp_ns)) for stamp_ns, _, name in job.pictures)
@@ -188,7 +189,7 @@ def launch_key(job: RenderJob) -> Hashable | None:
 
 
 def pose_cameras(job: RenderJob) -> PictureViews:
-    """Launch the poses of camera and bodies at the instants of a job; return where they are."""
+    """Launch the poses of cameras and bodies at the instants of a job; return their arrays."""
     group, buffers, instant_count = job.group, job.buffers, len(job.stamps_ns)
     p_WC, q_WC, stamps, bodies = buffers.p_WC, buffers.q_WC, buffers.stamps, buffers.bodies
     if buffers.chosen_slots is not None:
@@ -200,21 +201,21 @@ def pose_cameras(job: RenderJob) -> PictureViews:
         if group.motions is not None and bodies is not None:
             pose_bodies(group.motions, there["stamps"], group.instants, count=count, poses=bodies)
 
-    def pose_at(offsets_ns: Any, **there: Any) -> None:
+    def compute_poses(offsets_ns: Any, **there: Any) -> None:
         pose(offsets_ns, there["stamps"].shape[0], **there)
 
-    def find_twists(twist: Any) -> None:
+    def compute_twists(twist: Any) -> None:
         job.trace.camera_twists(job.from_slots, twist, **camera)
 
     rows = instant_count * group.offsets_ns.shape[0] if group.world_count == 1 else stamps.shape[0]
     pose(group.offsets_ns, rows, p_WC=p_WC, q_WC=q_WC, stamps=stamps, bodies=bodies)
     return PictureViews(
-        instant_count, job.to_slots, p_WC, q_WC, stamps, job.active, bodies, pose_at, find_twists
+        instant_count, job.to_slots, p_WC, q_WC, stamps, job.active, bodies, compute_poses, compute_twists
     )
 
 
 def render(job: RenderJob, views: PictureViews) -> None:
-    """Launch the rendering of all instants of a job, and what sensors make of their pictures."""
+    """Launch the rendering of all instants of a job, then the processing of pictures (`PictureProcess`)."""
     group, buffers = job.group, job.buffers
     buffers.renderer.render(
         views.p_WC,
@@ -248,9 +249,10 @@ def fetch_pictures(job: RenderJob) -> None:
 
 
 def plan_scans(state: State, batch: Batch) -> list[Launches]:
-    """Return what the frame sensors that are wanted make of a batch.
+    """Return the launches of the enabled frame sensors for a batch.
 
-    Those that have no reference, and all where worlds begin, take the first frame as one.
+    A sensor without a reference takes the first frame as its reference, and so do all sensors in worlds that
+    are reset.
     """
     jobs = {id(job.group): job for job in batch.jobs or ()}
     scans: list[Launches] = []
@@ -258,11 +260,11 @@ def plan_scans(state: State, batch: Batch) -> list[Launches]:
         job = jobs.get(id(group))
         buffers, stamps_ns = (group.buffers[0], []) if job is None else (job.buffers, job.stamps_ns)
         for name, sensor in group.frames.items():
-            if name not in batch.wanted:
+            if name not in batch.enabled_cameras:
                 continue
             frames = buffers.renderer.log_radiance
-            if stamps_ns and (batch.begins is not None or name not in group.watching):
-                mask = state.worlds.active if batch.begins is None else batch.begins
+            if stamps_ns and (batch.reset_mask is not None or name not in group.referenced):
+                mask = state.worlds.active if batch.reset_mask is None else batch.reset_mask
                 begin = partial(_begin, group, name, frames, stamps_ns, batch.until_ns, mask)
                 scans.append(Launches(None, begin))
             elif (scan := sensor.plan(frames, stamps_ns, batch.until_ns)) is not None:
@@ -274,18 +276,18 @@ def plan_scans(state: State, batch: Batch) -> list[Launches]:
 def _begin(
     group: RenderGroupState, name: str, frames: Any, stamps_ns: Sequence[int], end_ns: int, mask: Any
 ) -> None:
-    """Let a sensor take the first frame as its reference and, in one world, see those that follow."""
+    """Launch a sensor that takes the first frame as its reference, and scans the frames that follow."""
     sensor = group.frames[name]
     sensor.begin(frames, stamps_ns[0], mask)
-    group.watching.add(name)
+    group.referenced.add(name)
     scan = sensor.plan(frames[1:], stamps_ns[1:], end_ns) if len(stamps_ns) > 1 else None
     if scan is not None:
         scan.launch()
 
 
 def _is_all_in_place(batch: Batch) -> bool:
-    """Return whether the whole batch counts, and yields only pictures in buffers of the caller."""
-    return batch.until_ns == batch.boundaries[-1].stamp_ns and all(
+    """Return whether no run ends in the batch, and its only packets are pictures in buffers of the caller."""
+    return batch.until_ns == batch.stamps_ns[-1] and all(
         not job.frames and len(job.picture_buffers) == len(job.pictures) for job in batch.jobs or ()
     )
 
@@ -293,10 +295,10 @@ def _is_all_in_place(batch: Batch) -> bool:
 def read_cameras(
     state: State, batch: Batch, *, borrow: bool, meanwhile: Callable[[], None] | None = None
 ) -> list[Packet]:
-    """Wait until the cameras have seen a batch, and return what they yield.
+    """Wait for the renders and scans of a batch, and return the packets of its cameras.
 
-    With `borrow` pictures are views of the buffers of the batch. `meanwhile` is called while a device sorts
-    events; the next batch with the same buffers may be launched there.
+    With `borrow`, pictures are views of the buffers of the batch. `meanwhile` is called while the device
+    sorts events; it may launch the next batch with the same buffers.
     """
     packets: list[Packet] = []
     jobs = batch.jobs or ()
@@ -316,17 +318,17 @@ def read_cameras(
     if meanwhile is not None:
         meanwhile()
     with timed(state.wall_s, "events"):
-        events = [packet for hand_out in readings for packet in hand_out()]
+        events = [packet for collect in readings for packet in collect()]
         state.counts["events dropped"] += sum(getattr(packet, "dropped_count", 0) for packet in events)
     return packets + events
 
 
 def _read_images(job: RenderJob, *, borrow: bool) -> list[Packet]:
-    """Return the pictures of a job that the device has finished with.
+    """Return the pictures of a job that the device has finished.
 
-    With `borrow` those for which the caller has no buffer are views that are valid until the buffers are
-    overwritten, not copies, if what their sensor yields is an `Image`: of other packets nobody knows whether
-    they keep a view.
+    A picture in a buffer of the caller is returned there. Others are copies or, with `borrow`, views that are
+    valid until the buffers are overwritten. Only an `Image` gets a view: packets of other classes may keep
+    references to their picture.
     """
     copies: dict[tuple[str, int], NDArray[Any]] = {}
     packets: list[Packet] = []
@@ -347,7 +349,7 @@ def _read_images(job: RenderJob, *, borrow: bool) -> list[Packet]:
 
 
 def _image_slots(group: RenderGroupState, image_slots: Sequence[int]) -> NDArray[Any]:
-    """Return where the images of the instants of all worlds go, shape [N K]."""
+    """Return the image slots of the instants of all worlds, shape [N K]; -1: no picture."""
     own = np.full(group.capacity, -1)
     own[: len(image_slots)] = image_slots
     first = group.picture_count * np.arange(group.world_count)[:, None]
@@ -355,7 +357,7 @@ def _image_slots(group: RenderGroupState, image_slots: Sequence[int]) -> NDArray
 
 
 def _on_device(group: RenderGroupState, key: Hashable, slots: Callable[[], Any]) -> wp.array[int]:
-    """Return a list of slots on the device; the same key, which names a batch in flight, gives the same."""
+    """Return a cached list of slots on the device; the key contains the index of the batch in flight."""
     if key not in group.slots:
         if len(group.slots) >= _SLOT_LISTS_MAX:
             del group.slots[next(iter(group.slots))]

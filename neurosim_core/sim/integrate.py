@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined"
-"""The flight of one batch: commands in, the motion from boundary to boundary, what was sampled there out."""
+"""The motion of one batch: from commands to the samples of state sensors and collisions."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from neurosim_core.vehicle.arrays import STATUS_COLLISION, check_status
 logger = logging.getLogger(__name__)
 
 COLLISION = "collision"
-"""Name under which collisions are reported."""
+"""Sensor name of collision packets."""
 
 
 def forget_controllers(state: State) -> None:
-    """Have controllers of outside commands made anew, with other gains; the path controller stays.
+    """Discard the controllers of external commands, so that the next command makes them with new gains.
 
-    So does the buffer of rotor speeds, which have no controller: graphs copy from it.
+    The path controller stays, and so does the buffer of rotor speeds: graphs copy from it.
     """
     for mode in state.controllers:
         del state.commands[mode]
@@ -41,23 +41,23 @@ def forget_controllers(state: State) -> None:
 
 
 Command = Setpoint | ArrayLike | None
-"""What an outside controller commands: a setpoint, a row of its mode, or None: what holds now."""
+"""Command of an external controller: a setpoint, a row of its mode, or None (hold the rotor speeds)."""
 
 
 def set_command(model: Model, state: State, command: Command, mode: CommandMode) -> None:
-    """Have the next batch begin with a setpoint, which becomes rotor speeds at the state of the vehicle then.
+    """Set the command of the next batch, which converts it to rotor speeds at its first state.
 
-    Rows of one world come from the host, and the batch before has been read: what it took from there is free.
-    Those of many worlds, shape [N, width], may be on the device.
+    Commands of one world come from the host; the batch before must have been read, since it shares the
+    staging buffer. Commands of many worlds, shape [N, width], may be on the device.
 
     Raises:
-        ValueError: The path prescribes the motion, the mode is unknown, or rows are of a wrong shape or, on
-            the host, not finite.
+        ValueError: The path prescribes the motion, the mode is unknown, or rows have a wrong shape or, on the
+            host, are not finite.
     """
     if command is None:
         return
     if model.path.attitude is not None:
-        raise ValueError("path.kind poses is followed whatever is commanded: give no command")
+        raise ValueError("path.kind poses prescribes the motion and takes no commands: give no command")
     if isinstance(command, Setpoint):
         command, mode = command.row(), command.mode
     buffer = _command_buffer(model, state, mode)
@@ -72,7 +72,7 @@ def set_command(model: Model, state: State, command: Command, mode: CommandMode)
 
 
 def _command_buffer(model: Model, state: State, mode: CommandMode) -> CommandBuffer:
-    """Return where the setpoints of a mode go; the first time, its controller is made.
+    """Return the setpoint buffer of a mode; the first call makes its controller.
 
     Raises:
         ValueError: The mode is unknown.
@@ -94,40 +94,40 @@ def _command_buffer(model: Model, state: State, mode: CommandMode) -> CommandBuf
 
 
 def _checked_command(model: Model, state: State, command: ArrayLike, mode: CommandMode) -> Any:
-    """Return setpoints of the host as rows of the mode, shape [N, width]."""
+    """Return checked setpoints of the host as rows of the mode, shape [N, width]."""
     if mode == "motor_speeds":
         width = model.airframe.rotor_count
         return as_rows(command, name="rotor_speed_command", count=state.world_count, width=width)
     return state.controllers[mode].checked(command)
 
 
-def plan_batch(state: State, stretch: Stretch, *, closed_loop: bool, begins: Any = None) -> Batch:
-    """Return the batch that takes the vehicles through a stretch; nothing changes until it is launched.
+def plan_batch(state: State, stretch: Stretch, *, closed_loop: bool, reset_mask: Any = None) -> Batch:
+    """Return the batch of a stretch that begins where the last launched batch ends; changes no state.
 
-    It begins at the end of what was launched. With `closed_loop` the path controller commands; otherwise the
-    last command is held. Worlds whose mask `begins` is not 0 begin with it, device array of int32, shape [N].
+    With `closed_loop` the path controller commands; otherwise the last command is held. `reset_mask` is not 0
+    for worlds whose episode begins with the batch, device array of int32, shape [N]; None: none.
     """
     closed_loop = closed_loop and state.path_controller is not None
     number, begin_ns, max_step_ns = state.launched_count, state.launched_ns, state.vehicle.max_step_ns
     slot_count = state.trace.arrays.states.shape[0] // state.pipeline.flown_ahead
     return Batch(
         stretch=stretch,
-        boundaries=[Boundary(begin_ns + b[0], *b[1:]) for b in stretch.boundaries],
+        stamps_ns=[begin_ns + boundary.stamp_ns for boundary in stretch.boundaries],
         closed_loop=closed_loop,
         step_count=sum(-(-span_ns // max_step_ns) for span_ns in stretch.elapsed_ns),
         command_count=sum(boundary.control for boundary in stretch.boundaries) if closed_loop else 0,
         number=number,
         slot=number % state.pipeline.flown_ahead * slot_count,
-        wanted=state.wanted,
-        begins=begins,
+        enabled_cameras=state.enabled_cameras,
+        reset_mask=reset_mask,
         until_ns=begin_ns + stretch.duration_ns,
     )
 
 
 def take_command(state: State) -> Launches:
-    """Return what turns the command that was set into rotor speeds; it is taken with this.
+    """Return the launches that convert the command of `set_command` to rotor speeds, and clear the command.
 
-    A controller may be replaced by another; a graph keeps the one that it was made with.
+    Their key contains the controller, because a graph uses the controller that it was recorded with.
     """
     mode, state.command_mode = state.command_mode, None
     controller = None if mode is None else state.controllers.get(mode)
@@ -143,30 +143,30 @@ def take_command(state: State) -> Launches:
 
 
 def integrate(state: State, batch: Batch) -> None:
-    """Move the vehicles of all worlds from boundary to boundary, and sample what is due; launches only."""
+    """Integrate the vehicles of all worlds from boundary to boundary, and sample sensors; launches only."""
     elapsed_ns = 0
     samplers = list(state.samplers.values())
-    taken = [batch.slot] * len(samplers)
+    sample_slots = [batch.slot] * len(samplers)
     vehicle, trace, slot = state.vehicle, state.trace, batch.slot
     for boundary, span_ns, count in _spans(batch.stretch, joined=trace.joins_spans):
         end = slot + count
-        record = {"first": slot == batch.slot, "last": end == batch.slot + len(batch.boundaries)}
+        record = {"first": slot == batch.slot, "last": end == batch.slot + len(batch.stamps_ns)}
         trace.advance(slot, elapsed_ns, span_ns, count, **record)
         slot, elapsed_ns = end, elapsed_ns + count * span_ns
         for index in boundary.samplers:
-            samplers[index].measure(taken[index])
-            taken[index] += 1
+            samplers[index].measure(sample_slots[index])
+            sample_slots[index] += 1
         if batch.closed_loop and boundary.control and state.path_controller is not None:
             state.path_controller.update(vehicle.arrays)
 
 
 def _spans(stretch: Stretch, *, joined: bool) -> Iterator[tuple[Boundary, int, int]]:
-    """Yield spans between boundaries: the boundary at the end, the length [ns] and how many are `joined`.
+    """Yield runs of equal spans: the boundary at their end, the length of a span [ns], and their number.
 
-    Those are joined that are equal, and between which nothing is due.
+    With `joined`, equal spans with nothing due between them form one run; else each span is a run.
     """
     count = 0
-    following = [*stretch.elapsed_ns[1:], -1]  # no span is that long: the last one is yielded, also one of 0
+    following = [*stretch.elapsed_ns[1:], -1]  # -1 differs from every span, so the last run is yielded
     for boundary, span_ns, next_ns in zip(stretch.boundaries, stretch.elapsed_ns, following, strict=True):
         count += 1
         if not joined or boundary.samplers or boundary.control or next_ns != span_ns:
@@ -175,18 +175,18 @@ def _spans(stretch: Stretch, *, joined: bool) -> Iterator[tuple[Boundary, int, i
 
 
 def fetch_flight(state: State, batch: Batch) -> None:
-    """Launch the copy of what was flown and sampled to the host."""
-    state.trace.fetch(batch.slot, len(batch.boundaries))
+    """Launch the copies of states and samples to the host."""
+    state.trace.fetch(batch.slot, len(batch.stamps_ns))
     for index, copies in enumerate(state.sampler_copies.values()):
-        sample_count = sum(index in boundary.samplers for boundary in batch.boundaries)
+        sample_count = len(batch.stretch.sampler_places.get(index, ()))
         for copy in copies.values():
             copy.fetch(batch.slot, sample_count)
 
 
 def read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
-    """Return what was sampled in a batch that is flown, and collisions."""
-    rows = state.trace.numpy(batch.slot, len(batch.boundaries))
-    state.stamp_ns = batch.boundaries[-1].stamp_ns
+    """Return the packets of state sensors and the collisions of a batch whose motion is finished."""
+    rows = state.trace.numpy(batch.slot, len(batch.stamps_ns))
+    state.stamp_ns = batch.stamps_ns[-1]
     state.counts["steps"] += batch.step_count
     state.counts["commands"] += batch.command_count
     _count_redone(state, sum(rows.redone[-1].tolist()))  # of few vehicles: ufuncs take ten times as long
@@ -196,7 +196,7 @@ def read_flight(model: Model, state: State, batch: Batch) -> list[Packet]:
     packets = _collide(model, state, batch, rows)  # may end the run before the end of the batch
     batch.until_ns = state.stamp_ns
     packets += _read_samplers(state, batch)
-    reached = [b.stamp_ns for b in batch.boundaries if b.stamp_ns <= state.stamp_ns]
+    reached = [stamp_ns for stamp_ns in batch.stamps_ns if stamp_ns <= state.stamp_ns]
     if reached:
         row = rows.states[len(reached) - 1, 0]
         state.last = Odometry(
@@ -221,7 +221,7 @@ def _count_redone(state: State, redone_count: int) -> None:
 
 
 def _failure(state: State) -> DynamicsError:
-    """Return why a vehicle is held."""
+    """Return the error of a vehicle that is held after a failed integration."""
     try:
         check_status(state.vehicle.arrays)
     except DynamicsError as error:
@@ -232,7 +232,7 @@ def _failure(state: State) -> DynamicsError:
 def _read_samplers(state: State, batch: Batch) -> list[Packet]:
     packets: list[Packet] = []
     for index, (name, copies) in enumerate(state.sampler_copies.items()):
-        stamps = [boundary.stamp_ns for boundary in batch.boundaries if index in boundary.samplers]
+        stamps = [batch.stamps_ns[place] for place in batch.stretch.sampler_places.get(index, ())]
         if not stamps:
             continue
         columns = {field: copy.rows(batch.slot, len(stamps))[:, 0] for field, copy in copies.items()}
@@ -251,19 +251,17 @@ def _read_samplers(state: State, batch: Batch) -> list[Packet]:
 
 
 def _collide(model: Model, state: State, batch: Batch, rows: TraceRows) -> list[Packet]:
-    """Report each beginning of a touch; end the run at the first one if so configured."""
+    """Return a packet for each beginning of a contact; the first ends the run if so configured."""
     packets: list[Packet] = []
     if not any(margin_m <= 0.0 for margin_m in rows.clearance[:, 0].tolist()):
         state.touching = False
         return packets
-    for boundary, row, margin_m in zip(
-        batch.boundaries, rows.states[:, 0], rows.clearance[:, 0], strict=True
-    ):
+    for stamp_ns, row, margin_m in zip(batch.stamps_ns, rows.states[:, 0], rows.clearance[:, 0], strict=True):
         touching = bool(margin_m <= 0.0)
         if touching and not state.touching:
             packets.append(
                 Collision(
-                    stamp_ns=boundary.stamp_ns,
+                    stamp_ns=stamp_ns,
                     sequence=state.sequence[COLLISION],
                     sensor=COLLISION,
                     position=row[POSITION],
@@ -274,14 +272,14 @@ def _collide(model: Model, state: State, batch: Batch, rows: TraceRows) -> list[
             state.counts["collisions"] += 1
             if model.config.vehicle.on_collision == "end":
                 state.ended = True
-                state.stamp_ns = boundary.stamp_ns
+                state.stamp_ns = stamp_ns
                 return packets
         state.touching = touching
     return packets
 
 
 def in_order(model: Model, packets: list[Packet], until_ns: int) -> list[Packet]:
-    """Return packets up to a stamp in the order of time, those of one stamp in that of the rig."""
+    """Return packets up to a stamp in the order of time; packets of one stamp are in the order of the rig."""
     kept = [packet for packet in packets if packet.stamp_ns <= until_ns]
     if len(kept) < 2:
         return kept

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined"
-"""The model of a run, which does not change during it: the scene, the path, and what is computed of them."""
+"""The model of a run: the scene, the path and the data derived from them, all constant during the run."""
 
 from __future__ import annotations
 
@@ -35,19 +35,19 @@ from neurosim_core.vehicle import MultirotorConfig
 from neurosim_core.warp_start import find_device
 
 _POSE_RATE_HZ = 500.0
-"""Least rate at which poses are recorded for rays with times of their own [Hz]: where rotors answer
-within 20 ms, what is interpolated between is off by less than 1e-7 of an amplitude."""
+"""Lowest rate at which poses are recorded for rays with times of their own [Hz]. For rotors with a time
+constant of 20 ms, poses interpolated between them are off by less than 1e-7 of an amplitude."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """The data that do not change during a run."""
+    """The data that stay constant during a run."""
 
     config: SimulationConfig
     device: str
     scene: Scene
     bodies: tuple[Body, ...]
-    """Bodies that move in the scene besides the vehicle; not loaded without cameras."""
+    """Bodies that move in the scene besides the vehicle; empty if there are no cameras."""
     free_space: FreeSpace
     path: Path
     airframe: MultirotorConfig
@@ -73,15 +73,16 @@ def make_model(
     on_phase: Callable[[str], None] | None = None,
     meanwhile: Callable[[Model, Callable[[], bool]], None] | None = None,
 ) -> Model:
-    """Load or generate the scene, plan the path and decide what has to be computed.
+    """Load or generate the scene, plan the path, and derive render groups and the schedule.
 
     Args:
-        config: What to fly; one vehicle.
-        reader: Reads the scene in another process; None: it is read here.
-        on_phase: Told the name of each part of the work when it begins.
-        meanwhile: Called while the scene is lit and paths are planned (`warm_flight`) with a model that needs
-            the same kernels: it hovers, and sees a triangle, or nothing by a renderer that is not `warp`. Its
-            second argument says whether the scene is lit.
+        config: Settings of a run with one vehicle.
+        reader: Reads the scene in another process; None: this process reads it.
+        on_phase: Called with the name of each part of the set-up when it begins.
+        meanwhile: Called while light is baked and paths are planned, to compile kernels (`warm_flight`). Its
+            first argument is a model that needs the same kernels: it hovers in front of one triangle, or has
+            no cameras with renderers other than `warp`. Its second argument returns whether the light is
+            ready.
 
     Raises:
         ValueError: There are several vehicles, the scene cannot be loaded, no path exists, or the device is
@@ -97,8 +98,8 @@ def make_model(
 def refit(model: Model, config: SimulationConfig, *, replan: bool = False) -> Model:
     """Return a model with other sensors, rates and launches in the same scene and light.
 
-    Vehicle, device and renderer of `config` are those of `model`; its scene is not looked at, and its path is
-    flown if it is to `replan`.
+    Vehicle, device and renderer of `config` must be those of `model`. The scene of `config` is ignored; its
+    path is planned with `replan`, else the path of `model` is kept.
 
     Raises:
         ValueError: No path exists.
@@ -140,7 +141,7 @@ def _make_fleet(
     on_phase: Callable[[str], None] | None,
     meanwhile: Callable[[Model, Callable[[], bool]], None] | None,
 ) -> dict[str, Model]:
-    """Do what `make_fleet` does, if the reader could read the scene."""
+    """Do the work of `make_fleet`; raises `NotReadError` if the reader cannot read the scene."""
     setup_s: dict[str, float] = defaultdict(float)
 
     def phase(name: str) -> AbstractContextManager[None]:
@@ -150,54 +151,56 @@ def _make_fleet(
 
     device = find_device(config.device)
     members = {name: config.of(name) for name in config.vehicles}
-    seeing = any(plan_render_groups(member.sensors) for member in members.values())
-    bodies = make_bodies(config.bodies) if seeing else ()
-    with ThreadPoolExecutor(max_workers=5) as aside:
-        beginning = aside.submit(wp.zeros, 1, device=device)  # a CUDA context begins while the scene is read
+    has_cameras = any(plan_render_groups(member.sensors) for member in members.values())
+    bodies = make_bodies(config.bodies) if has_cameras else ()
+    with ThreadPoolExecutor(max_workers=5) as executor:
+        context = executor.submit(wp.zeros, 1, device=device)  # creates the CUDA context
 
         def map_scene() -> FreeSpace:
             geometry = reading.result()
-            beginning.result()  # Warp makes a device's streams at its first use, which must be in one thread
+            context.result()  # Warp makes a device's streams at its first use, which must be in one thread
             return map_distances(geometry, config.free_space, device)
 
-        def plan_there() -> tuple[FreeSpace, dict[str, Path]]:
+        def plan_in_other_process() -> tuple[FreeSpace, dict[str, Path]]:
             if reader is None or reader.planner is None:
                 raise NotPlannedError
-            return _plan_there(members, reader.planner, reading.result(), mapping.result)
+            return _plan_in_other_process(members, reader.planner, reading.result(), mapping.result)
 
         def upload(scene: Scene) -> Any:
-            beginning.result()
+            context.result()
             return upload_scene(scene, config.render, device=device, renderer=config.renderer, bodies=bodies)
 
         with phase("scene"):
             if reader is None:  # in this thread, where Ctrl-C interrupts it
-                scene = config.scene.load(pictures=seeing)
-                reading = aside.submit(lambda: scene)
+                scene = config.scene.load(pictures=has_cameras)
+                reading = executor.submit(lambda: scene)
             else:
-                reading = aside.submit(reader.geometry, config.scene)
-            mapping = aside.submit(map_scene)
-            planning = aside.submit(plan_there)
+                reading = executor.submit(reader.geometry, config.scene)
+            mapping = executor.submit(map_scene)
+            planning = executor.submit(plan_in_other_process)
             scene = reading.result() if reader is None else reader.scene(config.scene)
             lighting = None
-            if seeing:  # kernels that light needs, too, are loaded by the sketch: never in two threads
-                sketch = upload(_sketch(scene)) if meanwhile and config.renderer.kind == "warp" else None
-                lighting = aside.submit(upload, scene)
+            if has_cameras:  # the placeholder loads the kernels of baked light: two threads must not
+                placeholder = None
+                if meanwhile is not None and config.renderer.kind == "warp":
+                    placeholder = upload(_placeholder_scene(scene))
+                lighting = executor.submit(upload, scene)
         with phase("free space"):
-            room = mapping.result()
+            unseeded = mapping.result()
         with phase("kernels"):
             if meanwhile is not None and lighting is not None:
                 first = next(iter(members.values()))
-                if sketch is None:
-                    blind = {key: s for key, s in first.sensors.items() if isinstance(s, StateSensorConfig)}
-                    first = first.model_copy(update={"sensors": blind})
-                path = hover(HoverConfig(), position=room.seed_m)
-                warm = _make_member(first, device, scene, bodies, room, path, sketch, setup_s)
+                if placeholder is None:
+                    sensors = {k: s for k, s in first.sensors.items() if isinstance(s, StateSensorConfig)}
+                    first = first.model_copy(update={"sensors": sensors})
+                path = hover(HoverConfig(), position=unseeded.seed_m)
+                warm = _make_member(first, device, scene, bodies, unseeded, path, placeholder, setup_s)
                 meanwhile(warm, lighting.done)
         with phase("path"):
             try:
                 free_space, paths = planning.result()
             except NotPlannedError:
-                free_space, paths = _plan_here(members, room, scene)
+                free_space, paths = _plan_in_this_process(members, unseeded, scene)
         with phase("light"):
             on_device = None if lighting is None else lighting.result()
     return {
@@ -206,8 +209,8 @@ def _make_fleet(
     }
 
 
-def _sketch(scene: Scene) -> Scene:
-    """Return a triangle that is rendered by the same kernels as a scene."""
+def _placeholder_scene(scene: Scene) -> Scene:
+    """Return a scene of one triangle that needs the same render kernels as `scene`."""
     glows = any(max(material.emission) > 0.0 for material in scene.materials)
     texture = Texture(name="", srgb=np.zeros((1, 1, 3), np.uint8))
     material = Material(
@@ -234,7 +237,7 @@ def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) 
     """Return the paths of vehicles by name, as `make_fleet` plans them; without light and cameras.
 
     Args:
-        config: What to fly.
+        config: Settings of the run.
         vehicles: Names of vehicles; None: all.
 
     Raises:
@@ -247,34 +250,34 @@ def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) 
     return {name: plan_path(member, free_space) for name, member in members.items()}
 
 
-def _plan_there(
+def _plan_in_other_process(
     members: Mapping[str, SimulationConfig],
     planner: PlanningProcess,
     scene: Scene,
     mapped: Callable[[], FreeSpace],
 ) -> tuple[FreeSpace, dict[str, Path]]:
-    """Have another process do what `_plan_here` does.
+    """Plan as `_plan_in_this_process` does, in another process.
 
     Raises:
-        NotPlannedError: It could not, or it would take longer than here.
+        NotPlannedError: That process failed, or planning there takes longer than here.
     """
     flights = [(config.path, config.duration_s) for config in members.values()]
     if not all(isinstance(path, CollisionFreeConfig) for path, _ in flights):
-        planner.close()  # or it would stay, with its libraries, as long as the flight
+        planner.close()  # its libraries would stay in memory during the flight
         raise NotPlannedError
     for config in members.values():
         check_thrust(config.path, config.vehicle.airframe())
-    room = next(iter(members.values())).free_space
-    free_space, paths = planner.plan(scene, room, flights, mapped=mapped)
+    settings = next(iter(members.values())).free_space
+    free_space, paths = planner.plan(scene, settings, flights, mapped=mapped)
     return free_space, dict(zip(members, paths, strict=True))
 
 
-def _plan_here(
+def _plan_in_this_process(
     members: Mapping[str, SimulationConfig], unseeded: FreeSpace, scene: Scene
 ) -> tuple[FreeSpace, dict[str, Path]]:
     """Return the map of a scene with its seed, and the path of each vehicle by name."""
-    room = next(iter(members.values())).free_space
-    free_space = choose_seed(unseeded, room, inside_m=scene.inside_m)
+    settings = next(iter(members.values())).free_space
+    free_space = choose_seed(unseeded, settings, inside_m=scene.inside_m)
     return free_space, {name: plan_path(member, free_space) for name, member in members.items()}
 
 
@@ -282,8 +285,8 @@ def plan_path(config: SimulationConfig, free_space: FreeSpace) -> Path:
     """Return the path of the only vehicle.
 
     Args:
-        config: What to fly.
-        free_space: Where it can fly in the scene of `config`.
+        config: Settings of a run with one vehicle.
+        free_space: Free space of the scene of `config`.
 
     Raises:
         ValueError: No path exists, or it begins inside a solid or below the ground.
@@ -339,7 +342,7 @@ def _make_member(
 
 
 def _pose_clocks(config: SimulationConfig, groups: Sequence[RenderGroup]) -> tuple[Rate, ...]:
-    """Return a multiple of the control clock at which poses are recorded, if rays have times of their own."""
+    """Return the clock at which poses are recorded for rays with times of their own; empty without them."""
     if not any(group.window_ns for group in groups):
         return ()
     control_hz = config.control.rate_hz

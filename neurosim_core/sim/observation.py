@@ -20,9 +20,10 @@ class Samples:
     """The samples of a state sensor in a step, in the order of time, valid until the next step or reset."""
 
     arrays: Mapping[str, Any]
-    """By name, as the fields of its packets: device arrays of shape [sample, N, ...]."""
+    """Device arrays of shape [sample, N, ...], by the names of its packet fields; lost samples have 0 in the
+    array `received`."""
     offsets_ns: tuple[int, ...]
-    """When each sample was taken, after the begin of the step [ns]."""
+    """Time of each sample since the begin of the step [ns]."""
     packet: Callable[..., Packet | None]
     """Returns a sample of one world as a packet: `Sampler.packet`."""
 
@@ -36,17 +37,17 @@ class Observation:
     clock_ns: wp.array[wp.int64]
     """Time since the reset of each world [ns], shape [N]."""
     frames: Mapping[str, Any]
-    """Results of each frame sensor: of an event camera, `sensors.event_worlds.WorldEvents`."""
+    """Results of each frame sensor; those of an event camera are `sensors.event_worlds.WorldEvents`."""
     images: Mapping[str, Any]
     """The last picture of each image sensor: rgb, uint8 [N, H, W, 3]; depth [m], float32 [N, H, W]; ..."""
     fresh: frozenset[str]
-    """Image sensors that took their picture in this step."""
+    """Names of image sensors that took a picture in this step."""
     samples: Mapping[str, Samples]
-    """Of each state sensor."""
+    """Samples of each state sensor."""
     collided: wp.array[wp.int32]
-    """1: the vehicle touched the scene in this step, or is held because it did; shape [N]."""
+    """1: the vehicle touched the scene in this step, or is held after a contact; shape [N]."""
     status: wp.array[wp.int32]
-    """0, or why a vehicle is held: index into `vehicle.arrays.STATUS_TERMS`, shape [N]."""
+    """0, or the reason why a vehicle is held, an index into `vehicle.arrays.STATUS_TERMS`; shape [N]."""
 
     @property
     def events(self) -> Mapping[str, Any]:
@@ -55,11 +56,12 @@ class Observation:
 
 
 def make_observation(state: State, stretch: Stretch) -> Observation:
-    """Return the views of what a stretch of many worlds yields."""
+    """Return views of the results of a stretch in many worlds."""
     arrays = state.vehicle.arrays
     samples = {}
     for index, (name, sampler) in enumerate(state.samplers.items()):
-        offsets_ns = stretch.sample_offsets_ns(index)
+        places = stretch.sampler_places.get(index, ())
+        offsets_ns = tuple(stretch.boundaries[place].stamp_ns for place in places)
         samples[name] = Samples(
             arrays={field: _first(rows, len(offsets_ns)) for field, rows in sampler.arrays.items()},
             offsets_ns=offsets_ns,

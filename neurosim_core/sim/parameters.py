@@ -1,4 +1,4 @@
-"""Parameters that differ from world to world: arrays of camera settings -> the cameras of each world."""
+"""Parameters that differ between worlds: arrays of camera settings -> the cameras of each world."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ class WorldSettings:
 
     scenes: SceneTable
     seeds: Sequence[int]
-    """Of each world."""
+    """Seed of each world."""
     rigs: Sequence[Rig]
     """The sensors of each world."""
     instant_count: int
-    """The most instants of a group in one step."""
+    """Largest number of instants of a group in one step."""
     slot_count: int
-    """The most boundaries of one step."""
+    """Largest number of boundaries in one step."""
     lenses: Mapping[str, Sequence[Lens]] = field(default_factory=dict)
-    """Lenses of cameras that worlds change at resets, in place of those of `rigs`."""
+    """Lenses that worlds can switch between at resets, by camera, in place of those of `rigs`."""
     event_capacity: int | None = None
-    """Room for the events of one world and camera in one step."""
+    """Capacity for the events of one world and camera in one step."""
     ordered: bool = True
     """Sort events."""
 
 
 def vary_sensors(sensors: Rig, parameters: Mapping[str, ArrayLike], count: int) -> list[Rig]:
-    """Return the sensors of each world, which differ from those of the configuration by some parameters.
+    """Return the sensors of each world: those of the configuration with the values of `parameters`.
 
     Parameters are one number for each world by name of the camera and key: "front.threshold_on",
     "front.shot_noise.rate_hz" (keys of the pixels of an event camera), "front.lens.horizontal_fov_rad".
@@ -85,10 +85,10 @@ def lenses_differ(rigs: Sequence[Rig]) -> bool:
 
 
 def check_lenses(sensors: Rig, lenses: Mapping[str, Sequence[Lens]]) -> None:
-    """Refuse lenses of what is no camera, or of another size than its pictures.
+    """Check the lenses that cameras can switch between.
 
     Raises:
-        ValueError: There are some.
+        ValueError: A name is no camera, or a lens has another size than its pictures.
     """
     for name, table in lenses.items():
         camera = sensors.get(name)
@@ -96,7 +96,7 @@ def check_lenses(sensors: Rig, lenses: Mapping[str, Sequence[Lens]]) -> None:
             raise ValueError(f"lenses: {name!r} is no camera, known: {', '.join(sensors)}")
         size = camera.optics.width, camera.optics.height
         if not table or any((lens.width, lens.height) != size for lens in table):
-            raise ValueError(f"lenses of {name!r}: give one at least, all of {size[0]} x {size[1]} px")
+            raise ValueError(f"lenses of {name!r}: give at least one, all of {size[0]} x {size[1]} px")
 
 
 def lens_tables(group: RenderGroup, worlds: WorldSettings) -> tuple[list[Any], list[int]]:
@@ -116,7 +116,7 @@ def lens_tables(group: RenderGroup, worlds: WorldSettings) -> tuple[list[Any], l
         for name, other in found.items():
             if other != lens:
                 raise ValueError(
-                    f"{group.names[0]!r} and {name!r} share their rays, and have different lenses in world "
+                    f"{group.names[0]!r} and {name!r} share their rays but have different lenses in world "
                     f"{world}: give both the same"
                 )
         chosen.append(lenses.setdefault(lens, len(lenses)))

@@ -1,8 +1,9 @@
 # mypy: disable-error-code="attr-defined,call-overload"
-"""The device buffers of one render group, in all worlds; `cameras.py` takes batches through them.
+"""The device buffers of a render group, in all worlds. `cameras.py` renders batches into them.
 
-Several batches may be in flight. Each has a renderer of its own: what a batch saw stays until it has been
-read. Instants are [world, K] in this order in all arrays.
+A render group is a set of cameras that share mount, lens and clock, and therefore rays. Each batch in flight
+has its own renderer and buffers, which keep its pictures until they are read. All arrays of instants are in
+the order [world, K].
 """
 
 from __future__ import annotations
@@ -51,8 +52,8 @@ if TYPE_CHECKING:
     from neurosim_core.sensors.displacement import DisplacementRule
 
 PictureAllocator = Callable[[str, int, NDArray[Any]], NDArray[Any] | None]
-"""Returns memory for a camera's picture of a stamp [ns], like the one that is given; None: there is none.
-On a CUDA device it is pinned, and the picture is there when the device has finished with the batch."""
+"""Returns a buffer for a camera's picture of a stamp [ns], of the shape and dtype of the given array, or
+None. On a CUDA device the buffer is pinned, and holds the picture once the device has finished the batch."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -62,16 +63,17 @@ class ImageChannel:
     config: PictureSensorConfig
     rate: Rate
     source: str
-    """Its pictures are those of this output of the renderer, or those that its own processing makes."""
+    """Name of the array that holds its pictures: an output of the renderer, or of its own processing."""
     constants: Mapping[str, Any] = field(default_factory=dict)
-    """Fields that all its packets have."""
+    """Packet fields that are the same in all its packets."""
     sequence: int = 0
+    """Sequence number of its next packet."""
     gives_images: bool = False
-    """Its last packet was an `Image`: pictures of its next one may be lent."""
+    """Its last packet was an `Image`, so the next picture may be a view."""
 
     @property
     def output(self) -> str:
-        """The render outputs that it needs."""
+        """The render output that its pictures are made of."""
         return self.config.output
 
 
@@ -81,18 +83,20 @@ class BatchBuffers:
 
     renderer: Renderer
     copies: Mapping[str, HostCopy]
-    """Pictures on the host by source; empty: they stay on the device."""
+    """Host copies of pictures, by source; empty if pictures stay on the device."""
     processes: Mapping[str, PictureProcess]
     """Processing of pictures on the device, by the name of the sensor."""
     p_WC: wp.array[wp.vec3]
-    """Positions of the camera at the instants [m], shape [N K]; [N K J] where rays have own times."""
+    """Positions of the camera at the instants [m], shape [N K]; [N K J] for rays with times of their own."""
     q_WC: wp.array[wp.quat]
+    """Orientations of the camera at the instants, xyzw, same shape."""
     stamps: Any
-    """Times of the instants [ns], shape [N K, 1], or [N K J, 1]; empty if nobody asks."""
+    """Times of the instants [ns], shape [N K, 1] or [N K J, 1]; empty if neither bodies nor processing need
+    them."""
     bodies: BodyPoses | None
-    """Poses of bodies at the instants; None: nothing moves but the vehicle."""
+    """Poses of bodies at the instants; None: there are no bodies."""
     chosen_slots: HostInput | None
-    """Slots of the ticks chosen, which do not come again; None: all ticks are rendered."""
+    """Trace slots of the ticks that an adaptive group chose; None: the group renders all ticks."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -103,44 +107,46 @@ class RenderGroupState:
     device: str
     world_count: int
     capacity: int
-    """K, the most instants of one batch in each world."""
+    """K, the largest number of instants of one batch in each world."""
     picture_count: int
-    """M, the most pictures of one batch in each world."""
+    """M, the largest number of pictures of one batch in each world."""
     rate: Rate
+    """Clock of the group."""
     worlds: RenderWorlds
-    """The cameras that are rendered together."""
+    """Lens and scene of each world."""
     times: RayTimes | None
-    """When rays are cast; None: at the instant."""
+    """Times of the rays, relative to the instant; None: all rays are cast at the instant."""
     images: dict[str, ImageChannel]
+    """The image sensors, by name."""
     buffers: Sequence[BatchBuffers] = ()
     """One for each batch in flight."""
     frames: dict[str, FrameSensor] = field(default_factory=dict)
-    """The frame sensors."""
-    watching: set[str] = field(default_factory=set)
-    """Frame sensors that have a reference, and saw every instant that was rendered since."""
+    """The frame sensors, by name."""
+    referenced: set[str] = field(default_factory=set)
+    """Frame sensors that have a reference frame and have scanned every rendered instant since."""
     pictures: dict[str, Any] = field(default_factory=dict)
-    """The last picture of each image sensor, where they stay on the device: arrays [N, H, W, ...]."""
+    """The last picture of each image sensor, if pictures stay on the device: arrays [N, H, W, ...]."""
     shared_pictures: dict[str, Any] = field(default_factory=dict)
-    """Pictures of the renderer, for image sensors whose last picture another one of the group replaces."""
+    """Renderer outputs to copy into `pictures`, for image sensors slower than another one of the group."""
     p_BC: Any
     """Position of the camera on the body in each world [m], vec3d, shape [N]."""
     q_BC: Any
     """Its orientation there, xyzw, quatd, shape [N]."""
     offsets_ns: Any
-    """From an instant to its J rays [ns], device array; [0] where all are cast at the instant."""
+    """The J ray times relative to the instant [ns], device array; [0] if all rays are cast at the stamp."""
     instants: Any
-    """0, 1, ... N K J - 1: the rows of the poses of a batch in order."""
+    """0, 1, ... N K J - 1: indices of the poses of a batch."""
     motions: wp.array[Motion] | None
-    """Of the bodies; None: nothing moves but the vehicle."""
+    """Motions of the bodies; None: there are no bodies."""
     slots: dict[Hashable, wp.array[int]] = field(default_factory=dict)
-    """Lists of slots on the device by batch in flight: the same few come again and again. What one uploads on
-    its stream is not there yet for another, whose stream does not wait for it."""
+    """Cache of slot lists on the device. Keys contain the batch in flight, because a list that is uploaded on
+    the stream of one batch is not visible to the stream of another."""
     rule: DisplacementRule | None
-    """Chooses the ticks that are rendered; None: all are."""
+    """Chooses the ticks that are rendered; None: all ticks are rendered."""
     only_launches: bool
     """See `RendererConfig.only_launches`."""
     allocate_picture: PictureAllocator | None
-    """Gives memory that pictures are copied to as a part of the rendering; None: they get their own."""
+    """Returns buffers of the caller for pictures; None: pictures are copied to buffers of the engine."""
 
 
 def make_render_groups(
@@ -154,22 +160,22 @@ def make_render_groups(
     on_host: bool,
     allocate_picture: PictureAllocator | None,
 ) -> list[RenderGroupState]:
-    """Allocate the buffers of all groups; there are none where the scene is not on the device.
+    """Allocate the buffers of all groups; there are none if the model has no cameras.
 
-    Seeds are those of each world, device array of uint64; the history is for sensors that look back, and the
-    clock that of each world. With `on_host` pictures and events become packets, and `allocate_picture` may
-    give memory to copy a picture to.
+    `seeds` is a device array of uint64, `clock_ns` one of int64, both of shape [N]; `history` is the recorded
+    motion for sensors that look back. With `on_host`, pictures and events become packets, and
+    `allocate_picture` may return buffers for pictures.
 
     Raises:
-        ValueError: The renderer cannot say what moves how far, and a group is adaptive; or a picture, or an
-            adaptive group, is not for many worlds.
+        ValueError: A group is adaptive and its renderer or lens does not support that; or an adaptive group
+            or an image sensor does not support many worlds.
     """
     groups: list[RenderGroupState] = []
     for index, plan in enumerate(model.groups if model.scene_on_device is not None else ()):
         if not on_host and plan.max_displacement_px is not None:
             raise ValueError(
-                f"max_displacement_px of {', '.join(plan.frame_sensors)} is for single runs: it chooses "
-                "what to render for one vehicle, on the host"
+                f"max_displacement_px of {', '.join(plan.frame_sensors)} is for single runs only: the "
+                "host chooses the instants of one vehicle"
             )
         capacity = model.schedule.ticks_per_batch(index) if on_host else worlds.instant_count
         sensors = {name: model.config.sensors[name] for name in plan.frame_sensors}
@@ -252,7 +258,7 @@ def _make_group(
 def _make_buffers(
     group: RenderGroupState, model: Model, worlds: WorldSettings, seeds: Any, *, on_host: bool
 ) -> BatchBuffers:
-    """Allocate what one batch writes; constants and sources of the images are set."""
+    """Allocate the buffers of one batch; also sets constants and sources of the image channels."""
     renderer = make_renderer(
         model.scene_on_device,
         group.plan.lens,
@@ -301,7 +307,7 @@ def _make_buffers(
 
 
 def _render_worlds(group: RenderGroup, worlds: WorldSettings, device: str) -> RenderWorlds:
-    """Return who is rendered together."""
+    """Return lens and scene of each world."""
     lenses, lens_of_world = lens_tables(group, worlds)
     return RenderWorlds(
         count=len(worlds.seeds),
@@ -332,17 +338,19 @@ def _image_channels(
 
 
 def _ray_times(group: RenderGroup, scene: Any) -> RayTimes | None:
-    """Return when the rays of a group are cast; None: all at the stamp."""
+    """Return the times at which the rays of a group are cast; None: all at the stamp."""
     if group.timing is None:
         return None
     if not isinstance(scene, SceneArrays):
         names = ", ".join(group.names)
-        raise ValueError(f"{names}: rays with times of their own need renderer: warp")
+        raise ValueError(
+            f"{names}: a shutter or LiDAR, whose rays have different times, needs renderer: warp"
+        )
     return ray_times_of(group.timing, group.lens, scene)
 
 
 def _picture_arrays(group: RenderGroupState) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return where the last picture of each image sensor is, and what has to be copied there from where."""
+    """Return the array of the last picture of each image sensor, and outputs to copy into some of them."""
     images, buffers = group.images, group.buffers[0]
     fastest_hz = max((image.rate.rate_hz for image in images.values()), default=0.0)
     pictures = {name: getattr(buffers.renderer, image.output) for name, image in images.items()}
@@ -352,19 +360,19 @@ def _picture_arrays(group: RenderGroupState) -> tuple[dict[str, Any], dict[str, 
 
 
 def _picture_count(group: RenderGroup, images: Mapping[str, ImageChannel], capacity: int) -> int:
-    """Return the most pictures of a batch; cameras may alternate.
+    """Return the largest number of pictures in a batch; cameras may alternate.
 
-    Of n consecutive ticks of the group, every m-th is at most floor((n - 1) / m) + 1.
+    n consecutive ticks of the group contain at most floor((n - 1) / m) + 1 of every m-th tick.
     """
     most = sum(int(capacity * i.rate.rate_hz / group.rate.rate_hz) + 1 for i in images.values())
     return max(1, min(capacity, most))
 
 
 def move_bodies(groups: Iterable[RenderGroupState], bodies: Mapping[str, BodyConfig]) -> None:
-    """Let the same bodies move otherwise from now on; waits for the device.
+    """Give the bodies other motions from now on; waits for the device.
 
     Args:
-        groups: All render groups of a state; nothing may be being rendered.
+        groups: All render groups of a state; no render may be in flight.
         bodies: Settings of all bodies, by name, in the order of the model; only `motion` may differ.
     """
     for group in groups:
@@ -383,12 +391,12 @@ def _make_rule(
     if not isinstance(scene, SceneArrays):
         raise ValueError(
             f"max_displacement_px of {', '.join(group.frame_sensors)} needs the renderer 'warp': "
-            "the others do not know where things are"
+            "others do not measure how far points move"
         )
     if not isinstance(group.lens, PinholeConfig):
         raise ValueError(
             f"max_displacement_px of {', '.join(group.frame_sensors)} needs a lens of kind pinhole, got "
-            f"{getattr(group.lens, 'kind', 'none')}: leave it out, and all ticks are rendered"
+            f"{getattr(group.lens, 'kind', 'none')}: without max_displacement_px all ticks are rendered"
         )
     from neurosim_core.sensors.displacement import DisplacementRule  # whose kernels few runs need
 
@@ -404,9 +412,9 @@ def _make_rule(
 
 
 def render_terms(group: RenderGroupState) -> tuple[str, ...]:
-    """Return what a group computes beyond its outputs: for the scene, its settings, lens, pictures."""
+    """Return the optional terms that are compiled into a group, besides its outputs."""
     renderer = group.buffers[0].renderer
-    terms = getattr(renderer, "terms", None)  # only Warp's has a kernel made to measure
+    terms = getattr(renderer, "terms", None)  # only the renderer `warp` compiles a kernel for its terms
     present = {} if terms is None else terms._asdict()
     if getattr(renderer, "antialiased", False):
         present |= {"supersampled": False, "antialiased": True}

@@ -1,12 +1,13 @@
 # mypy: disable-error-code="attr-defined"
-"""A run, batch by batch: with the path controller on the device, or with a controller outside.
+"""Single runs: with the path controller on the device, or with an external controller.
 
-On a CUDA device `run_model` launches the next batches before it reads one back, so the device always has
-work; what was launched beyond the end of a run is never read.
+`run_model` flies with the path controller. On a CUDA device it launches the next batches before it reads one
+back, so the device always has work; batches launched beyond the end of a run are never read.
 
-An external controller steps one control period at a time: `step` flies one and returns its packets, or
-`begin_step` and `end_step` do, with time between them while a CUDA device is at work. `integrate_period`
-flies one and leaves the cameras to another thread, which calls `render_batch` or `skip_batch`.
+An external controller advances one control period at a time. `step` launches a period and returns its
+packets. `begin_step` and `end_step` do the same in two halves, between which the host can work while a CUDA
+device is busy. `integrate_period` launches the motion only; another thread renders with `render_batch` or
+`skip_batch`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from neurosim_core.packets import Odometry, Packet
 from neurosim_core.runtime.timing import timed
 from neurosim_core.sim.cameras import (
     acquire_picture_buffers,
-    is_due,
+    due_places,
     pictures_due,
     plan_ahead,
     read_cameras,
@@ -57,7 +58,7 @@ def run(config: SimulationConfig | Mapping[str, Any] | str | FilePath | None = N
 def run_model(model: Model, state: State) -> Iterator[Packet]:
     """Yield every packet from the state's present stamp to the end of the run; see `run`.
 
-    Where the state keeps several batches in flight, the vehicle is up to as many ahead of the packets.
+    With several batches in flight, the vehicle is up to that many batches ahead of the packets.
     """
     if state.launched_count == 0:
         yield from start(model, state)
@@ -78,32 +79,33 @@ def run_model(model: Model, state: State) -> Iterator[Packet]:
 
 
 def step(model: Model, state: State, command: Command, *, mode: CommandMode = "motor_speeds") -> list[Packet]:
-    """Hold a command of an outside controller until the next tick of the control clock.
+    """Hold a command of an external controller until the next tick of the control clock.
 
     Args:
-        model: What does not change.
-        state: Moved on by one control period.
+        model: The model of the run.
+        state: The state of the run; advanced by one control period.
         command: A setpoint (`control.setpoints`), or a row of the mode (`control.modes.MODES`), by default
-            rotor speeds [rad/s], shape [R]. Modes above it are turned into rotor speeds once, at the
-            beginning of the period. None: the rotor speeds that hold now.
-        mode: What a row is.
+            rotor speeds [rad/s], shape [R]. Other modes are converted to rotor speeds once, at the beginning
+            of the period. None: hold the present rotor speeds.
+        mode: Command mode of a row.
 
     Returns:
-        What the sensors yield in (stamp, next stamp], in the order of time; the first call also yields stamp
-        0. Less where a collision ended the run (`state.ended`) or the integration failed (`state.failure`).
+        The packets in (stamp, next stamp], in the order of time; the first call also returns those of stamp
+        0. The list ends early if a collision ended the run (`state.ended`) or the integration failed
+        (`state.failure`).
 
     Raises:
-        ValueError: The command is of a wrong shape or not finite.
-        DynamicsError: The integration has failed before; what was measured until then has been returned.
+        ValueError: The command has a wrong shape or is not finite.
+        DynamicsError: The integration failed in an earlier period, whose packets have been returned.
     """
     return end_step(model, state, begin_step(model, state, command, mode=mode))
 
 
 class PendingStep(NamedTuple):
-    """A control period that has been launched as far as it can be."""
+    """A control period that `begin_step` has launched, and `end_step` will read back."""
 
     packets: list[Packet]
-    """Packets of the sensors up to its beginning, if they have not been returned yet."""
+    """Packets from before the period: those of stamp 0 in the first period."""
     end_ns: int
     """Its end [ns]."""
 
@@ -111,21 +113,21 @@ class PendingStep(NamedTuple):
 def begin_step(
     model: Model, state: State, command: Command, *, mode: CommandMode = "motor_speeds"
 ) -> PendingStep:
-    """Begin a control period like `step`, without waiting for a CUDA device.
+    """Launch a control period like `step`, without waiting for a CUDA device.
 
     Args:
-        model: What does not change.
-        state: Has to go to `end_step` before anything else is done to it.
-        command: As of `step`.
-        mode: As of `step`.
+        model: The model of the run.
+        state: The state of the run; the next call with it must be `end_step`.
+        command: See `step`.
+        mode: See `step`.
 
     Returns:
-        What `end_step` needs.
+        The argument of `end_step`.
 
     Raises:
-        RuntimeError: A period is pending, or `run_model` was broken off.
-        ValueError: The command is of a wrong shape or not finite.
-        DynamicsError: The integration has failed before.
+        RuntimeError: A period is pending, or `run_model` was interrupted.
+        ValueError: The command has a wrong shape or is not finite.
+        DynamicsError: The integration failed in an earlier period.
     """
     if state.failure is not None:
         raise state.failure
@@ -133,7 +135,10 @@ def begin_step(
     packets = start(model, state) if state.launched_count == 0 else []
     set_command(model, state, command, mode)
     batch, state.planned = state.planned, None
-    if batch is None or (batch.number, batch.wanted) != (state.launched_count, state.wanted):
+    if batch is None or (batch.number, batch.enabled_cameras) != (
+        state.launched_count,
+        state.enabled_cameras,
+    ):
         batch = _plan_period(model, state)
     end_ns = model.schedule.period_end_ns(state.launched_ns)
     launch(model, state, batch)
@@ -141,10 +146,10 @@ def begin_step(
 
 
 def prepare_step(model: Model, state: State) -> None:
-    """Plan the next control period, for `begin_step` to launch it sooner; while a CUDA device is at work.
+    """Plan the next control period while a CUDA device is busy, so that `begin_step` takes less time.
 
     Args:
-        model: What does not change.
+        model: The model of the run.
         state: Keeps the plan, which the next `begin_step` uses unless other cameras have been selected.
     """
     state.planned = _plan_period(model, state)
@@ -152,24 +157,24 @@ def prepare_step(model: Model, state: State) -> None:
 
 
 def acquire_next_picture_buffers(state: State) -> None:
-    """Ask for buffers for the pictures of a control period that was prepared: `begin_step` is sooner then."""
+    """Ask for picture buffers of a prepared control period, so that `begin_step` takes less time."""
     if state.planned is not None:
         for job in state.planned.jobs or ():
             acquire_picture_buffers(job)
 
 
 def settle(state: State) -> None:
-    """Wait until the device has written all pictures that were handed out (see `allocate_picture`)."""
+    """Wait until the device has written all pictures to the buffers of the caller (`allocate_picture`)."""
     state.pipeline.wait_all()
 
 
 def end_step(model: Model, state: State, pending: PendingStep) -> list[Packet]:
-    """Wait for a control period that is pending, and return what `step` returns.
+    """Wait for a pending control period, and return its packets as `step` does.
 
     Args:
-        model: What does not change.
-        state: Moved on by the period.
-        pending: What `begin_step` returned.
+        model: The model of the run.
+        state: The state of the run; advanced by the period.
+        pending: The return value of `begin_step`.
     """
     packets = pending.packets + read(model, state, last=state.launched_ns >= pending.end_ns)
     while state.launched_ns < pending.end_ns and not (state.ended or state.failure is not None):
@@ -180,35 +185,35 @@ def end_step(model: Model, state: State, pending: PendingStep) -> list[Packet]:
 
 
 def warm_up(model: Model) -> None:
-    """Compile and load the kernels of all sensors: fly one control period of an episode that nobody sees."""
+    """Compile and load the kernels of all sensors: fly one control period of an episode and discard it."""
     step(model, make_state(model), None)
 
 
 def warm_flight(model: Model, *_: object) -> None:
-    """Compile and load the kernels of a flight: look once, and fly one control period.
+    """Compile and load the kernels of a flight: render once, and fly one control period.
 
-    For `make_model(meanwhile=...)`. Nothing is in flight, and all is on the present stream of the device. No
-    launches come twice, which would be recorded as a graph while other threads launch.
+    This is an argument for `make_model(meanwhile=...)`. It uses the current stream of the device, and no
+    launch twice: a second launch would be recorded as a graph while other threads launch.
     """
     state = make_state(model, in_flight=1)
     start(model, state)
-    state.wanted = frozenset()
+    state.enabled_cameras = frozenset()
     advance(model, state, model.schedule.batch_end_ns(0, model.schedule.period_end_ns(0)))
 
 
 def integrate_period(
     model: Model, state: State, command: Command, *, mode: CommandMode = "motor_speeds"
 ) -> tuple[list[Packet], list[Batch]]:
-    """Fly one control period like `step`, and leave the cameras for later.
+    """Integrate one control period like `step`, without its cameras.
 
     Returns:
-        Packets of the IMU and of odometry, and collisions, in the order of time; and what the cameras have to
-        look at: each batch goes to `render_batch` or `skip_batch`, in order, from one thread at a time.
+        Packets of state sensors and collisions, in the order of time; and the batches to render. Pass each
+        batch to `render_batch` or `skip_batch`, in order, from one thread at a time.
 
     Raises:
-        RuntimeError: More batches wait for the cameras than may: see `render_backlog_left`.
-        ValueError: The command is of a wrong shape or not finite.
-        DynamicsError: The integration has failed before; what was measured until then has been returned.
+        RuntimeError: Too many batches wait for rendering: see `render_backlog_left`.
+        ValueError: The command has a wrong shape or is not finite.
+        DynamicsError: The integration failed in an earlier period, whose packets have been returned.
     """
     if state.failure is not None:
         raise state.failure
@@ -218,14 +223,14 @@ def integrate_period(
     def fly(stretch: Stretch) -> None:
         if render_backlog_left(state) < 1:
             raise RuntimeError(
-                f"{state.pipeline.flown_ahead} batches wait for render_batch() or skip_batch(), "
-                "and no more may"
+                f"{state.pipeline.flown_ahead} batches wait for render_batch() or skip_batch(), as many as "
+                "make_state(render_backlog=...) allows: render or skip one"
             )
         batch = plan_batch(state, stretch, closed_loop=False)
         launch_flight(state, batch)
         batches.append(batch)
         with timed(state.wall_s, "read-back"):
-            state.pipeline.wait_flown(batch.number)
+            state.pipeline.wait_flight(batch.number)
             packets.extend(in_order(model, read_flight(model, state, batch), state.stamp_ns))
 
     if state.launched_count == 0:
@@ -239,7 +244,7 @@ def integrate_period(
 
 
 def render_backlog_left(state: State) -> int:
-    """Return how many batches `integrate_period` can fly before one of those that wait was looked at."""
+    """Return the number of batches that `integrate_period` may add before one is rendered or skipped."""
     return state.pipeline.flown_ahead - (state.launched_count - state.rendered_count)
 
 
@@ -247,9 +252,9 @@ def render_batch(model: Model, state: State, batch: Batch) -> list[Packet]:
     """Render a batch of `integrate_period`; return the packets of its cameras in the order of time.
 
     Args:
-        model: What does not change.
-        state: Only what belongs to the cameras changes, so that another thread may fly on.
-        batch: The oldest that neither `render_batch` nor `skip_batch` has had.
+        model: The model of the run.
+        state: The state of the run. Only camera data change, so another thread may integrate meanwhile.
+        batch: The oldest batch that was neither rendered nor skipped.
     """
     launch_cameras(model, state, batch)
     packets = read_cameras(state, batch, borrow=state.borrow_pictures)
@@ -258,36 +263,35 @@ def render_batch(model: Model, state: State, batch: Batch) -> list[Packet]:
 
 
 def skip_batch(model: Model, state: State, batch: Batch) -> int:
-    """Render nothing of a batch, in place of `render_batch`; arguments are the same.
+    """Skip the renders of a batch, in place of `render_batch`; arguments are the same.
 
-    The sequence of each image camera shows the gap; for an event camera log radiance is linear in time over
-    the gap, and a window of events that should have ended there is as much longer.
+    The sequence numbers of image cameras show the gap. For an event camera, log radiance is linear in time
+    over the gap, and a window of events that should end in it extends to the next render.
 
     Returns:
-        How many instants were not rendered.
+        Number of instants that were not rendered.
     """
     count = 0
     for index, group in enumerate(state.groups):
-        group.watching &= batch.wanted
-        stamps = [b.stamp_ns for b in batch.boundaries if index in b.groups]
-        for stamp_ns in stamps:
-            count += is_due(group, stamp_ns, batch.wanted)
-            for name in pictures_due(group, stamp_ns, batch.wanted):
+        places = due_places(group, batch, index)
+        count += len(places)
+        for place in places:
+            for name in pictures_due(group, batch.stamps_ns[place], batch.enabled_cameras):
                 group.images[name].sequence += 1
     state.rendered_count += 1
     return count
 
 
 def select_cameras(model: Model, state: State, names: Collection[str]) -> None:
-    """Choose the cameras that look, from the next control period on; the others are not rendered.
+    """Select the cameras that are rendered, from the next control period on.
 
-    An event camera that comes back takes the first instant that it sees as its reference, and its packets
-    count on.
+    An event camera that is enabled again takes the next rendered instant as its reference, and its sequence
+    numbers continue.
 
     Args:
-        model: What does not change.
-        state: The cameras that look are part of it.
-        names: Names of the cameras that look, in the settings.
+        model: The model of the run.
+        state: The state of the run, which keeps the selection.
+        names: Names of the cameras in the settings.
 
     Raises:
         ValueError: There is no such camera.
@@ -295,11 +299,11 @@ def select_cameras(model: Model, state: State, names: Collection[str]) -> None:
     known = {name for group in model.groups for name in group.names}
     if not known.issuperset(names):
         raise ValueError(f"unknown cameras {sorted(set(names) - known)}, known: {sorted(known)}")
-    state.wanted = frozenset(names)
+    state.enabled_cameras = frozenset(names)
 
 
 def observe(state: State) -> Odometry:
-    """Return the true state of the vehicle at the end of what was flown, as a packet named `odometry`."""
+    """Return the true state of the vehicle at the state's stamp, as a packet named `odometry`."""
     if state.last is None:
         now = read_state(state.vehicle.arrays)._asdict()
         state.last = Odometry(sensor="odometry", **{name: rows[0] for name, rows in now.items()})
@@ -307,29 +311,27 @@ def observe(state: State) -> Odometry:
 
 
 def start(model: Model, state: State) -> list[Packet]:
-    """Sample every sensor at stamp 0, and return the packets; event cameras take it as their reference.
+    """Sample every sensor at stamp 0, and return the packets; event cameras take their reference there.
 
     Args:
-        model: What does not change.
-        state: As `make_state` returns it: nothing has been launched.
+        model: The model of the run.
+        state: A new state, from `make_state`.
     """
     launch(model, state, plan_batch(state, model.schedule.first(), closed_loop=True))
     return read(model, state)
 
 
 def advance(model: Model, state: State, end_ns: int) -> list[Packet]:
-    """Fly one batch, at most to what `Schedule.batch_end_ns` gives, and return what the sensors yield in it.
-
-    The path controller commands.
+    """Fly one batch with the path controller, and return its packets.
 
     Args:
-        model: What does not change.
-        state: Moved on to `end_ns`, or to where a collision ended the run (`ended`) or the integration failed
-            (`failure`).
-        end_ns: End of the batch [ns], after the state's stamp.
+        model: The model of the run.
+        state: The state of the run; advanced to `end_ns`, or to the stamp at which a collision ended the run
+            (`ended`) or the integration failed (`failure`).
+        end_ns: End of the batch [ns], after the state's stamp, at most `Schedule.batch_end_ns`.
 
     Raises:
-        RuntimeError: `run_model` was broken off, and the vehicle is ahead of the state's stamp.
+        RuntimeError: `run_model` was interrupted, so batches are in flight.
     """
     _check_all_read(state)
     launch_until(model, state, end_ns)
@@ -340,9 +342,9 @@ def launch_until(model: Model, state: State, end_ns: int, *, closed_loop: bool =
     """Launch one batch, as `advance` flies it, without waiting for a CUDA device.
 
     Args:
-        model: What does not change.
-        state: Has room for one more batch in flight.
-        end_ns: End of the batch [ns], after what was launched before.
+        model: The model of the run.
+        state: The state of the run, with fewer batches in flight than its maximum.
+        end_ns: End of the batch [ns], after the end of the last launched batch.
         closed_loop: The path controller commands; otherwise the last command is held.
     """
     stretch = model.schedule.stretch(state.launched_ns, end_ns)
@@ -350,9 +352,9 @@ def launch_until(model: Model, state: State, end_ns: int, *, closed_loop: bool =
 
 
 def finish(state: State) -> list[Packet]:
-    """Return the packets whose windows have begun and not ended; for the end of a run."""
+    """Return the packets of open windows, cut at the state's stamp; for the end of a run."""
     sensors = [
-        group.frames[name] for group in state.groups for name in group.frames if name in group.watching
+        group.frames[name] for group in state.groups for name in group.frames if name in group.referenced
     ]
     return [packet for sensor in sensors for packet in sensor.flush(until_ns=state.stamp_ns)]
 
@@ -360,12 +362,13 @@ def finish(state: State) -> list[Packet]:
 def _check_all_read(state: State) -> None:
     if state.in_flight:
         raise RuntimeError(
-            "batches are under way: run_model() was broken off, and only it can go on, or end_step() is due"
+            "batches are in flight: call end_step() after begin_step(); after an interrupted run_model(), "
+            "call run_model() again"
         )
 
 
 def _parts_of_period(model: Model, state: State) -> Iterator[int]:
-    """Yield the ends of the batches that a control period is cut into, each when the one before was flown."""
+    """Yield the end of each batch of a control period; the caller launches it before the next is yielded."""
     end_ns = model.schedule.period_end_ns(state.launched_ns)
     while state.launched_ns < end_ns:
         yield model.schedule.batch_end_ns(state.launched_ns, end_ns)

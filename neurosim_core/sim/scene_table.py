@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined,call-overload"
-"""The scenes that worlds are in: one for all, or several, which kernels find by index."""
+"""The scenes of worlds: one scene for all worlds, or several that kernels find by index."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from neurosim_core.warp_start import find_device
 _logger = logging.getLogger(__name__)
 
 SceneSource = str | Path | Mapping[str, Any]
-"""A settings file, of which the scene counts; a mesh file; or settings of a scene."""
+"""A settings file, whose scene is used; a mesh file; or settings of a scene."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,9 +32,9 @@ class SceneTable:
     """The scenes of all worlds, on the device."""
 
     models: tuple[Model, ...]
-    """One for each scene: its free space, the path in it, its light."""
+    """The model of each scene: free space, path and light."""
     scene_of_world: tuple[int, ...]
-    """Which scene a world is in."""
+    """Index of the scene of each world."""
     fields: wp.array[Any]
     """Distance to each scene, array of `DistanceField`, shape [scene]."""
     scene: wp.array[int]
@@ -42,7 +42,7 @@ class SceneTable:
     data: wp.array[Any] | None
     """`completed` on the device, array of `SceneData`; None: there is one row, or no camera."""
     row: wp.array[int]
-    """Which row of `data` the renderer reads in each world, shape [world]."""
+    """Row of `data` that the renderer reads in each world, shape [world]."""
     completed: tuple[SceneData, ...]
     """Arrays of each scene, or of each world, with all that a kernel for all scenes reads; empty: `data` is
     None."""
@@ -58,10 +58,10 @@ class SceneTable:
         """Return `dark_floor` or `exposure` of `SceneData` in each world, device array of float32, [world].
 
         Raises:
-            ValueError: Worlds share the light of their scene: they were not made with `own_light`.
+            ValueError: Worlds share the light of their scene: they were not made with `per_world_light`.
         """
         if self.data is None or len(self.data) != len(self.scene_of_world):
-            raise ValueError("the light is that of the scene in all worlds: make them with own_light=True")
+            raise ValueError("all worlds share the light of their scene: make them with per_world_light=True")
         offset = getattr(SceneData.ctype, name).offset
         size = wp.types.type_size_in_bytes(self.data.dtype)
         floats: Any = wp.array(
@@ -82,13 +82,13 @@ def make_scene_table(
     models: Sequence[Model] | None = None,
     scene_of_world: ArrayLike | None = None,
     lenses_differ: bool = False,
-    own_light: bool = False,
+    per_world_light: bool = False,
 ) -> SceneTable:
-    """Load the scenes of `count` worlds and bring them to the device; without any, that of the configuration.
+    """Load the scenes of `count` worlds, by default the configured one, and upload them.
 
-    `models` are scenes that were loaded before, each with its path and light. `scene_of_world` is the index
-    of each world's, shape [N]; by default they take turns. With `own_light` that of each world may be
-    changed.
+    `models` are loaded scenes, each with its path and light. `scene_of_world` is the index of
+    the scene of each world, shape [N]; by default 0, 1, ..., 0, 1, ... With `per_world_light`, the light of
+    each world can be changed.
 
     Raises:
         ValueError: A scene cannot be loaded, an index is out of range, the renderer is not `warp`, or bodies
@@ -96,11 +96,11 @@ def make_scene_table(
             or packed by other settings of the renderer than `config` says.
     """
     if config.renderer.kind != "warp":
-        raise ValueError(f"worlds are rendered by renderer 'warp', got {config.renderer.kind!r}")
+        raise ValueError(f"worlds need the renderer 'warp', got {config.renderer.kind!r}")
     if scenes is not None and models is not None:
         raise ValueError("give scenes or models, not both")
     if any(given is not None and len(given) == 0 for given in (scenes, models)):
-        raise ValueError("scenes or models must name one scene at least, got none")
+        raise ValueError("scenes or models must have at least one scene, got none")
     if len(scenes or models or ()) > 1 and config.bodies:
         raise ValueError(
             f"bodies move in one scene only, got {len(scenes or models or ())} scenes and "
@@ -109,8 +109,8 @@ def make_scene_table(
     if models is not None:
         _check_models(models, config)
     asked = isinstance(config.render.candidate_lists, CandidateListConfig)
-    if asked and (lenses_differ or own_light or len(scenes or models or ()) > 1):
-        _logger.info("render.candidate_lists is left out: worlds differ in scenes, lenses or light")
+    if asked and (lenses_differ or per_world_light or len(scenes or models or ()) > 1):
+        _logger.info("render.candidate_lists is not used: worlds differ in scenes, lenses or light")
         alone = config.render.model_copy(update={"candidate_lists": None})  # Embree may do it on a CPU
         config = config.model_copy(update={"render": alone})
     if models is not None:
@@ -126,15 +126,15 @@ def make_scene_table(
         raise ValueError(
             f"scene_of_world must be in [0, {len(made) - 1}], got {chosen.min()} to {chosen.max()}"
         )
-    return _table(made, chosen, own_light=own_light)
+    return _table(made, chosen, per_world_light=per_world_light)
 
 
 def single_scene(model: Model) -> SceneTable:
     """Return the table of one world in the scene of a model."""
-    return _table((model,), np.zeros(1, dtype=np.int64), own_light=False)
+    return _table((model,), np.zeros(1, dtype=np.int64), per_world_light=False)
 
 
-def _table(models: tuple[Model, ...], chosen: NDArray[Any], *, own_light: bool) -> SceneTable:
+def _table(models: tuple[Model, ...], chosen: NDArray[Any], *, per_world_light: bool) -> SceneTable:
     """Bring what worlds need of their scenes to the device; `chosen` is the scene of each world."""
     count = len(chosen)
     device = models[0].device
@@ -142,13 +142,13 @@ def _table(models: tuple[Model, ...], chosen: NDArray[Any], *, own_light: bool) 
     terms = None
     if arrays:
         terms = RenderTerms(*(max(values) for values in zip(*(a.terms for a in arrays), strict=True)))
-        terms = terms._replace(world_scenes=own_light or len(arrays) > 1)
+        terms = terms._replace(world_scenes=per_world_light or len(arrays) > 1)
     completed: tuple[SceneData, ...] = ()
     scene: Any = wp.array(chosen.astype(np.int32), dtype=int, device=device)
     row = scene
-    if arrays and (own_light or len(arrays) > 1):
+    if arrays and (per_world_light or len(arrays) > 1):
         completed = tuple(_completed(a) for a in arrays)
-    if own_light:
+    if per_world_light:
         completed = tuple(completed[index] for index in chosen)
         row = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=device)
     return SceneTable(
@@ -164,12 +164,12 @@ def _table(models: tuple[Model, ...], chosen: NDArray[Any], *, own_light: bool) 
 
 
 def _check_models(models: Sequence[Model], config: SimulationConfig) -> None:
-    """Refuse models that hold something else than is asked for."""
+    """Raise if models do not match the configuration."""
     wanted = find_device(config.device)
     for index, model in enumerate(models):
         if model.device != wanted:
             raise ValueError(
-                f"models[{index}] is on {model.device}, and worlds are to be on {wanted}: make it there"
+                f"models[{index}] is on {model.device}, but the worlds are on {wanted}: make the model there"
             )
         if model.config.bodies != config.bodies:
             raise ValueError(

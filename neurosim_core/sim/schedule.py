@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import NamedTuple
@@ -13,10 +13,10 @@ from typing import NamedTuple
 from neurosim_core.clock import Rate
 
 TICKS_PER_INSTANT = 4
-"""How many times as many ticks a batch takes of a group that renders only some of them."""
+"""A batch holds this many times as many ticks of an adaptive group, which renders only some of them."""
 STRETCH_COUNT_MAX = 512
-"""Most stretches that are remembered, as many as graphs; where clocks hardly ever tick together, no two are
-alike."""
+"""Largest number of cached stretches, equal to that of cached graphs. If clocks hardly ever tick together,
+all stretches differ."""
 _COMMON_MAX_NS = 10**13
 
 
@@ -27,17 +27,17 @@ class Boundary(NamedTuple):
     control: bool
     """A new command is due."""
     samplers: tuple[int, ...]
-    """Indices of the samplers that read the state."""
+    """Indices of the state sensors that sample here."""
     groups: tuple[int, ...]
-    """Indices of the groups that see this instant."""
+    """Indices of the render groups that have a tick here."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stretch:
-    """What happens in a stretch of a run, relative to its begin: the same launches fly equal stretches."""
+    """The boundaries of a part of a run, relative to its begin. Equal stretches need equal launches."""
 
     boundaries: tuple[Boundary, ...]
-    """Stamps are relative to the begin of the stretch."""
+    """The boundaries, with stamps relative to the begin of the stretch."""
     pictures: frozenset[str]
     """Image sensors that take a picture at the end of the stretch."""
 
@@ -48,61 +48,76 @@ class Stretch:
 
     @functools.cached_property
     def elapsed_ns(self) -> tuple[int, ...]:
-        """From each boundary's predecessor to it [ns]."""
+        """Time from the previous boundary to each boundary [ns]."""
         return tuple(b - a for a, b in itertools.pairwise([0, *(b.stamp_ns for b in self.boundaries)]))
 
     @functools.cached_property
     def flight(self) -> Hashable:
-        """What of it the flight depends on: spans, and what is due at their ends."""
+        """Key of the launches of the motion: the spans, and what is due at their ends."""
         return tuple(
             (span, b.control, b.samplers) for span, b in zip(self.elapsed_ns, self.boundaries, strict=True)
         )
 
-    def sample_offsets_ns(self, sampler: int) -> tuple[int, ...]:
-        """Return when a sampler reads the state [ns]."""
-        return tuple(b.stamp_ns for b in self.boundaries if sampler in b.samplers)
+    @functools.cached_property
+    def sampler_places(self) -> Mapping[int, Sequence[int]]:
+        """Indices of the boundaries at which each state sensor samples, by the index of the sensor."""
+        return _places([boundary.samplers for boundary in self.boundaries])
+
+    @functools.cached_property
+    def group_places(self) -> Mapping[int, Sequence[int]]:
+        """Indices of the boundaries at which each render group has a tick, by the index of the group."""
+        return _places([boundary.groups for boundary in self.boundaries])
+
+
+def _places(due: Sequence[tuple[int, ...]]) -> dict[int, list[int]]:
+    """Return the positions in `due` of each index."""
+    places: dict[int, list[int]] = {}
+    for place, indices in enumerate(due):
+        for index in indices:
+            places.setdefault(index, []).append(place)
+    return places
 
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """Every clock of a run."""
+    """All clocks of a run."""
 
     control: Rate
     samplers: tuple[Rate, ...]
     """Clocks of the sensors that read the state of the vehicle (IMU, odometry)."""
     groups: tuple[Rate, ...]
-    """Clocks of the groups."""
+    """Clocks of the render groups."""
     instants_per_launch: int
-    """The most instants of one group in one batch; of a sparse group, times TICKS_PER_INSTANT."""
+    """Largest number of instants of one group in one batch; of a sparse group, times TICKS_PER_INSTANT."""
     images: Mapping[str, Rate] = field(default_factory=dict, hash=False)
-    """Clocks of the image sensors, by name: each one's ticks are ticks of its group."""
+    """Clocks of the image sensors, by name. Each tick is also a tick of the sensor's render group."""
     sparse: frozenset[int] = frozenset()
-    """Indices of the groups that render only some of their ticks."""
+    """Indices of the adaptive groups, which render only some of their ticks."""
     poses: tuple[Rate, ...] = ()
-    """Clocks at which nothing is due but the pose is recorded, for rays with times of their own."""
+    """Clocks at which only the pose is recorded, for rays with times of their own."""
     _stretches: dict[tuple[int, int], Stretch] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
     @functools.cached_property
     def clocks(self) -> tuple[Rate, ...]:
-        """Those at whose ticks the integration stops."""
+        """The clocks at whose ticks the integration stops."""
         return (self.control, *self.samplers, *self.groups, *self.poses)
 
     @functools.cached_property
     def common_ns(self) -> int:
-        """All clocks tick together after so long [ns]; 0: that takes hours."""
+        """Common period of all clocks [ns]; 0 if it is longer than hours."""
         return _common_period_ns([*self.clocks, *self.images.values()])
 
     def ticks_per_batch(self, group: int) -> int:
-        """Return the most ticks of a group in one batch."""
+        """Return the largest number of ticks of a group in one batch."""
         return self.instants_per_launch * (TICKS_PER_INSTANT if group in self.sparse else 1)
 
     def batch_end_ns(self, start_ns: int, limit_ns: int) -> int:
-        """Return where the batch that follows `start_ns` ends: at most at `limit_ns`.
+        """Return the end of the batch that begins at `start_ns`, at most `limit_ns`.
 
-        It ends where the first of the groups has as many ticks as one launch takes; a rig without cameras
-        counts commands instead.
+        A batch ends when the first render group has as many ticks as one launch renders. A rig without
+        cameras counts control ticks instead.
         """
         rates = self.groups or (self.control,)
         ends = (_tick_after(rate, start_ns, self.ticks_per_batch(group)) for group, rate in enumerate(rates))
@@ -113,7 +128,7 @@ class Schedule:
         return _tick_after(self.control, start_ns, 1)
 
     def first(self) -> Stretch:
-        """Return what happens at stamp 0: everything."""
+        """Return the stretch of stamp 0, where every clock ticks."""
         everything = Boundary(
             stamp_ns=0,
             control=True,
@@ -123,7 +138,7 @@ class Schedule:
         return Stretch(boundaries=(everything,), pictures=frozenset(self.images))
 
     def stretch(self, start_ns: int, end_ns: int) -> Stretch:
-        """Return what happens in (start_ns, end_ns], in order of time; the last boundary is at `end_ns`."""
+        """Return the stretch (start_ns, end_ns]: boundaries in the order of time, the last at `end_ns`."""
         key = (start_ns % self.common_ns if self.common_ns else start_ns, end_ns - start_ns)
         stretch = self._stretches.get(key)
         if stretch is None:
@@ -148,14 +163,14 @@ class Schedule:
         )
 
     def boundary_count_max(self, span_s: float | None = None) -> int:
-        """Return a bound on the boundaries in any stretch of a length [s]; None: in any batch."""
+        """Return an upper bound of the boundaries in a stretch of a length [s]; None: in a batch."""
         if span_s is None:
             shortest = self.groups or (self.control,)
             span_s = min(self.ticks_per_batch(group) / rate.rate_hz for group, rate in enumerate(shortest))
         return sum(int(span_s * rate.rate_hz) + 2 for rate in self.clocks) + 1
 
     def instants_per_period(self) -> int:
-        """Return the most instants of any group in a control period, at least 1."""
+        """Return the largest number of instants of a group in a control period, at least 1."""
         return max((rate.ticks_within(self.control) for rate in self.groups), default=1) or 1
 
 
@@ -166,14 +181,14 @@ def _tick_after(rate: Rate, stamp_ns: int, count: int) -> int:
 
 @functools.cache
 def _due(mark: int, sampler_count: int, group_count: int) -> tuple[bool, tuple[int, ...], tuple[int, ...]]:
-    """Return whether a command is due, and the samplers and groups that are: from the lowest bit on."""
+    """Return whether a command is due, and which state sensors and groups are, from the bits of `mark`."""
     samplers = tuple(index for index in range(sampler_count) if mark >> (1 + index) & 1)
     groups = tuple(index for index in range(group_count) if mark >> (1 + sampler_count + index) & 1)
     return bool(mark & 1), samplers, groups
 
 
 def _common_period_ns(rates: list[Rate]) -> int:
-    """Return the least whole number of ns in which each clock makes a whole number of periods; 0: hours."""
+    """Return the shortest whole number of ns that is a whole number of periods of each clock; 0: hours."""
     common = Fraction(0)
     for rate in rates:
         period = Fraction(10**9) / Fraction(str(rate.rate_hz))

@@ -1,8 +1,8 @@
 # mypy: disable-error-code="attr-defined,call-overload,union-attr"
-"""N worlds, one vehicle each, stepped together; everything stays on the device.
+"""N worlds with one vehicle each, stepped together on the device.
 
-On a CUDA device a step is one graph: flight, poses, one render of all instants of all worlds, one scan of all
-their pixels. It allocates nothing and waits for nothing; results are arrays on the device that the next step
+On a CUDA device, a step is one graph: motion, poses, one render of all instants of all worlds, one scan of
+all their pixels. It neither allocates nor waits. Results are arrays on the device that the next step
 overwrites.
 """
 
@@ -42,44 +42,45 @@ from neurosim_core.trajectory.feasibility import GRAVITY_M_S2
 _logger = logging.getLogger(__name__)
 
 WORLD_COUNT_MAX = 4096
-"""Most worlds."""
+"""Largest number of worlds."""
 
 
 class Simulation:
     """N worlds that are stepped together; results are arrays on the device.
 
-    All worlds share the clocks of the rig. World i gives what `step` of a single run gives with the same
-    settings, its seed and its commands: the same bytes on a CPU.
+    All worlds share the clocks of the rig. World i gives the same results as a single run (`ns.step`) with
+    the same settings, seed and commands: the same bytes on a CPU.
 
-    A vehicle that touches the scene, where `vehicle.on_collision` is `end`, or whose motion cannot be
-    integrated, is held where it is until its world is reset; its cameras look on from there, and time passes.
+    A vehicle is held in place until its world is reset if it touches the scene and `vehicle.on_collision` is
+    `end`, or if its motion cannot be integrated. Its cameras keep rendering, and time goes on.
 
     Args:
-        config: What `load_config` returns or accepts: scene, vehicle, sensors, control; one vehicle.
+        config: Settings, or anything that `load_config` accepts: scene, sensors, control and one vehicle.
         worlds: Number of worlds N, 1 to 4096.
-        device: Where to compute; None: as configured.
-        seeds: Of world 0 (of the others: the next integers) or of each, shape [N]; None: as configured.
-        parameters: What differs from world to world, one number for each, shape [N]: thresholds, noise and
+        device: Device to compute on; None: as configured.
+        seeds: Seed of world 0 (world i has seed + i), or one seed per world, shape [N]; None: as configured.
+        parameters: Values that differ between worlds, one number per world, shape [N]: thresholds, noise and
             dead time of event cameras ("front.threshold_on", "front.shot_noise.rate_hz") and lenses
             ("front.lens.horizontal_fov_rad").
-        lenses: Lenses of cameras, by name, that worlds change between (`optics`); all begin with the first.
-        own_light: Let the light of each world be changed (`light`).
-        scenes: Scenes to be in: settings files, mesh files or settings; None: the configured one.
-        models: What `make_model` returned for each scene, in place of `scenes`: nothing is loaded twice. They
-            must be on the same device, and have the bodies and `render` of `config`.
-        scene_of_world: Which of them each world is in, shape [N]; by default they take turns.
-        event_capacity: Room for the events of one world and camera in one step; by default two for each
-            pixel. What does not fit is counted (`WorldEvents.dropped`).
-        sorted: Sort events by (t, y, x, polarity) within each world; else those of one world come in an order
-            that on a CUDA device differs from run to run.
+        lenses: Lenses that a camera can switch between, by name of the camera (`optics`); all worlds begin
+            with the first.
+        per_world_light: Each world has its own light, which can be changed (`light`).
+        scenes: Scenes of the worlds: settings files, mesh files or settings; None: the configured scene.
+        models: Models of the scenes from `make_model`, in place of `scenes`, so that nothing is loaded twice.
+            They must be on one device, and have the bodies and `render` settings of `config`.
+        scene_of_world: Index of the scene of each world, shape [N]; by default 0, 1, 2, ..., 0, 1, ...
+        event_capacity: Capacity for the events of one world and camera in one step; by default two per pixel.
+            Events beyond it are counted (`WorldEvents.dropped`).
+        sorted: Sort the events of each world by (t, y, x, polarity). Unsorted events of a world are in an
+            order that differs from run to run on a CUDA device.
 
     Attributes:
         count: Number of worlds N.
-        device: Where everything is.
-        duration_ns: How long the last step was [ns].
+        device: The Warp device of all arrays.
+        duration_ns: Length of the last step [ns].
 
     Raises:
-        ValueError: A setting is not for worlds, out of range, or of the wrong shape; see the message.
+        ValueError: A setting does not support worlds, is out of range, or has a wrong shape; see the message.
     """
 
     def __init__(
@@ -91,7 +92,7 @@ class Simulation:
         seeds: int | ArrayLike | None = None,
         parameters: Mapping[str, ArrayLike] | None = None,
         lenses: Mapping[str, Sequence[Lens]] | None = None,
-        own_light: bool = False,
+        per_world_light: bool = False,
         scenes: Sequence[SceneSource] | None = None,
         models: Sequence[Model] | None = None,
         scene_of_world: ArrayLike | None = None,
@@ -114,7 +115,7 @@ class Simulation:
             models=models,
             scene_of_world=scene_of_world,
             lenses_differ=lenses_differ(rigs) or bool(lenses),
-            own_light=own_light,
+            per_world_light=per_world_light,
         )
         self._model = model = self._scenes.model
         self.device = wp.get_device(model.device)
@@ -142,7 +143,7 @@ class Simulation:
 
     @property
     def model(self) -> Model:
-        """The model of the first scene, which does not change."""
+        """The model of the first scene."""
         return self._model
 
     @property
@@ -151,9 +152,9 @@ class Simulation:
         return [int(seed) for seed in self._state.seeds.numpy()]
 
     def thresholds(self, camera: str) -> Any:
-        """Return the thresholds of an event camera in each world, up and down, vec2d, shape [N].
+        """Return the ON and OFF thresholds of an event camera in each world, device array of vec2d, [N].
 
-        They are on the device, and may be written where a world is about to begin anew.
+        You may write the values of a world right before its reset.
 
         Raises:
             ValueError: There is no such event camera, or its pixels are not ideal.
@@ -163,13 +164,13 @@ class Simulation:
                 thresholds = getattr(group.frames[camera], "thresholds", None)
                 if thresholds is not None:
                     return thresholds
-        raise ValueError(f"{camera!r} is no event camera with ideal pixels: its thresholds stay as they are")
+        raise ValueError(f"{camera!r} is no event camera with ideal pixels: only theirs can be changed")
 
     def optics(self, camera: str) -> tuple[Any, Any, Any]:
-        """Return how a camera is mounted and looks in each world: p_BC [m], q_BC, and the number of its lens.
+        """Return the mount and the lens of a camera in each world: p_BC [m], q_BC, and the index of its lens.
 
-        They are device arrays of vec3d, quatd and int32, shape [N], and may be written where a world is about
-        to begin anew. Cameras that share its rays have the same.
+        They are device arrays of vec3d, quatd and int32, shape [N]. You may write the values of a world right
+        before its reset. Cameras that share rays share these arrays.
 
         Raises:
             ValueError: There is no such camera.
@@ -182,11 +183,12 @@ class Simulation:
     def light(self, name: str) -> Any:
         """Return `dark_floor` or `exposure` of the renderer in each world, device array of float32, [N].
 
-        They may be written where a world is about to begin anew. g times the light is 1/g of the dark floor
-        and g times the exposure: of log radiance all that changes else is a constant, log(g).
+        You may write the values of a world right before its reset. To scale the light by g, multiply the
+        exposure by g and divide the dark floor by g; log radiance then differs from that of the scaled light
+        by the constant log(g).
 
         Raises:
-            ValueError: The worlds were made without `own_light`.
+            ValueError: The simulation was made without `per_world_light`.
         """
         return self._scenes.light(name)
 
@@ -194,22 +196,22 @@ class Simulation:
     def airframes(self) -> Any:
         """Parameters of the multirotor of each world, device array of `vehicle.aerodynamics.Airframe`, [N].
 
-        They may be written between steps. Controllers and motors go on with the configured ones.
+        You may write them between steps. Controllers and motors keep the configured parameters.
         """
         return self._state.vehicle.airframes
 
     def throw_bodies(self, position: Any, velocity: Any) -> None:
-        """Let the bodies of each world fly freely, each world its own way, from the begin of its episode on.
+        """Let the bodies of each world fall freely from the begin of its episode.
 
-        They may be thrown anew where an episode is about to begin; the others must be thrown as before.
+        Change the values of a world only right before its reset; repeat those of the other worlds.
 
         Args:
-            position: p_WO of each body when the episode begins [m], device array of vec3d, shape [N, B].
-            velocity: Its velocity then in W [m/s], likewise.
+            position: p_WO of each body at the begin of the episode [m], device array of vec3d, shape [N, B].
+            velocity: Velocity of each body at that time in W [m/s], same type and shape.
 
         Raises:
-            ValueError: The shapes are others, or a sensor measures how bodies move, which it knows of bodies
-                of the configuration only.
+            ValueError: A shape is wrong, there are no bodies, or a sensor needs the motion of bodies, which
+                it knows from the settings only.
         """
         shape = (self._state.seeds.shape[0], len(self.model.config.bodies))
         for name, rows in (("position", position), ("velocity", velocity)):
@@ -217,16 +219,19 @@ class Simulation:
                 raise ValueError(f"{name} must be vec3d of shape {shape}, got {rows.dtype} {rows.shape}")
         for group in self._state.groups:
             if group.motions is None:
-                raise ValueError("there are no bodies to throw: say what they are in `bodies`")
+                raise ValueError("there are no bodies to throw: define them in the settings `bodies`")
             if any(each.processes for each in group.buffers) or group.rule is not None:
-                raise ValueError("bodies can be thrown where cameras give colour, depth and events only")
+                raise ValueError(
+                    "throw_bodies: cameras that process their pictures (optical_flow, lidar, ...), and "
+                    "max_displacement_px, know the configured motions of bodies only"
+                )
         for group in self._state.groups:
             assert group.motions is not None
             throw_bodies(group.motions, position, velocity, (0.0, 0.0, -GRAVITY_M_S2))
 
     @property
     def fields(self) -> Any:
-        """Distance to each scene, device array of `scene.freespace.DistanceField`, shape [scene]."""
+        """Distance field of each scene, device array of `scene.freespace.DistanceField`, shape [scene]."""
         return self._scenes.fields
 
     @property
@@ -241,7 +246,7 @@ class Simulation:
 
     @property
     def common_ns(self) -> int:
-        """Some worlds can be reset when all of them have flown for a multiple of this [ns]; 0: never."""
+        """Common period of all clocks [ns], at whose multiples some worlds can be reset; 0: never."""
         return self._schedule.common_ns
 
     def reset(
@@ -254,26 +259,26 @@ class Simulation:
         orientation: Any = None,
         body_rate: Any = None,
     ) -> Observation:
-        """Begin anew, in all worlds or in some, with rotors at hover; sample all sensors at stamp 0.
+        """Reset all worlds or some of them, with rotors at hover, and sample all sensors at stamp 0.
 
-        Event cameras take what they see as their reference; the events of the observation are none, in all
-        worlds. Rows of worlds that are not reset do not count. With arrays of a CUDA device nothing waits for
-        it.
+        Event cameras take the first render as their reference, so the observation has no events in any world.
+        Rows of worlds that are not reset are ignored. If all arguments are arrays of a CUDA device, the call
+        does not wait for it.
 
         Args:
-            mask: Which worlds, shape [N], of bool, uint8 or int32, on host or device; None: all.
-            seed: New seeds, of world 0 (of the others: the next integers) or of each, shape [N], on the host
-                or a Warp array of uint64 on the device; None: the same. Worlds that are not reset keep
-                theirs. Where the pixels of an event camera are not ideal, this waits for the device.
-            position: p_WB [m], shape [N, 3] or [3]; None: where the configured path begins.
-            velocity: v_WB in W [m/s], likewise.
-            orientation: q_WB, xyzw, shape [N, 4] or [4]; normalised here.
+            mask: Worlds to reset, shape [N], bool, uint8 or int32, on host or device; None: all.
+            seed: New seed of world 0 (world i gets seed + i), or one seed per world, shape [N], on the host
+                or as a Warp array of uint64 on the device; None: seeds stay. Worlds that are not reset keep
+                their seeds. If an event camera has noise, new seeds wait for the device.
+            position: p_WB [m], shape [N, 3] or [3]; None: the start of the configured path.
+            velocity: v_WB in W [m/s], shape [N, 3] or [3]; None: the start of the configured path.
+            orientation: q_WB, xyzw, shape [N, 4] or [4]; it is normalised.
             body_rate: w_WB in B [rad/s], shape [N, 3] or [3]; None: 0.
 
         Raises:
-            ValueError: A shape is wrong or a number not finite; or only some worlds are to be reset, and
-                clocks of the rig, which all worlds share, do not tick together now (see `common_ns`); or the
-                path is a motion that is prescribed, and a start is given.
+            ValueError: A shape is wrong or a number is not finite; the path prescribes the motion and a start
+                is given; or only some worlds are reset while the clocks of the rig, which all worlds share,
+                do not tick together (see `common_ns`).
         """
         given = {
             "position": position,
@@ -283,7 +288,7 @@ class Simulation:
         }
         if self._model.path.attitude is not None and any(value is not None for value in given.values()):
             names = ", ".join(name for name, value in given.items() if value is not None)
-            raise ValueError(f"path.kind poses says where an episode starts: give no {names}")
+            raise ValueError(f"path.kind poses prescribes the start of an episode: give no {names}")
         if mask is not None:
             self._check_partial()
         seeds = None if seed is None else checked_seeds(seed, self.count, self.device)
@@ -305,7 +310,7 @@ class Simulation:
         wp.copy(state.worlds.active, self._mask)  # sensors of the others do not see this
         if mask is None:
             state.launched_ns = 0
-        launch(self._model, state, plan_batch(state, first, closed_loop=False, begins=self._mask))
+        launch(self._model, state, plan_batch(state, first, closed_loop=False, reset_mask=self._mask))
         state.worlds.active.fill_(1)
         self._has_begun = True
         self.duration_ns = 0
@@ -314,22 +319,23 @@ class Simulation:
     def step(self, commands: Any = None, mode: CommandMode = "rates") -> Observation:
         """Hold a command in each world until the next tick of the control clock.
 
-        On a CUDA device this only queues work. Commands on the device must come from the stream of Warp or
-        from CUDA's default stream, which PyTorch uses unless told otherwise.
+        On a CUDA device this only queues work. Commands on the device must come from Warp's stream or from
+        CUDA's default stream, which is PyTorch's default.
 
         Args:
             commands: A setpoint (`control.setpoints`), or rows of the mode (`control.modes.MODES`), shape
-                [N, width] or, on the host, one row for all. NumPy, PyTorch, Warp or what else has DLPack,
-                float32 or float64. They are copied. None: the rotor speeds that hold now.
-            mode: What they are; turned into rotor speeds once, at the begin of the step.
+                [N, width] or, on the host, one row for all worlds; float32 or float64, from NumPy, PyTorch,
+                Warp or any library with DLPack. They are copied. None: hold the present rotor speeds.
+            mode: Command mode of the rows, converted to rotor speeds once, at the begin of the step.
 
         Returns:
-            What the sensors yield in (begin, end] of the step; overwritten by the next.
+            The results of all sensors in (begin, end] of the step; the next step overwrites them.
 
         Raises:
-            RuntimeError: The worlds were not reset.
-            ValueError: Commands on the host are of a wrong shape or not finite. Those on the device are not
-                looked at: a vehicle whose command is not finite is held (`Observation.status`).
+            RuntimeError: `reset` was not called.
+            ValueError: Commands on the host have a wrong shape or are not finite. The values of commands on
+                the device are not checked: a vehicle with a command that is not finite is held
+                (`Observation.status`).
         """
         self._require_reset()
         set_command(self._model, self._state, commands, mode)
@@ -339,13 +345,13 @@ class Simulation:
         """Follow the configured path for some control periods, with the controller on the device.
 
         Args:
-            periods: How many, at least 1.
+            periods: Number of control periods, at least 1.
 
         Returns:
-            What the sensors yield in the last of them.
+            The results of all sensors in the last period.
 
         Raises:
-            RuntimeError: The worlds were not reset.
+            RuntimeError: `reset` was not called.
             ValueError: `periods` is less than 1.
         """
         self._require_reset()
@@ -378,7 +384,7 @@ class Simulation:
         return self._observe(stretch)
 
     def _observe(self, stretch: Stretch) -> Observation:
-        """Return the views of what a stretch yields: the same arrays each time."""
+        """Return the views of the results of a stretch; equal stretches share one observation."""
         if stretch not in self._observations:
             if len(self._observations) >= STRETCH_COUNT_MAX:
                 self._observations.clear()
@@ -387,18 +393,18 @@ class Simulation:
 
     def _check_partial(self) -> None:
         if not self._has_begun:
-            raise ValueError("mask: the first reset is of all worlds")
+            raise ValueError("mask: the first reset must reset all worlds: give no mask")
         common_ns, now_ns = self.common_ns, self._state.launched_ns
         if common_ns == 0 or now_ns % common_ns != 0:
             when = f"every {common_ns} ns" if common_ns else "never"
             raise ValueError(
-                "mask: a world that begins now would not be in step with the clocks of the rig, which tick "
-                f"together {when}, and it is {now_ns} ns: give all sensors rates that are multiples of "
+                "mask: some worlds can be reset only when all clocks of the rig tick together, which is "
+                f"{when}; it is {now_ns} ns: give all sensors rates that are multiples of "
                 f"control.rate_hz = {self._model.config.control.rate_hz:g}, or reset some worlds only then"
             )
 
     def _reseed(self, seeds: Any) -> None:
-        """Give the worlds of the mask other seeds."""
+        """Set new seeds in the worlds of the mask."""
         inputs, outputs = [self._mask, seeds], [self._state.seeds]
         wp.launch(take_seeds, dim=self.count, inputs=inputs, outputs=outputs, device=self.device)
         sensors = [sensor for group in self._state.groups for sensor in group.frames.values()]
@@ -425,5 +431,5 @@ def _check_image_rates(schedule: Schedule) -> None:
         if not schedule.control.contains(rate):
             raise ValueError(
                 f"sensors.{name}.rate_hz must divide control.rate_hz = {schedule.control.rate_hz:g} in "
-                f"worlds, where pictures are taken at the end of steps, got {rate.rate_hz:g}"
+                f"worlds, which take pictures at the end of steps, got {rate.rate_hz:g}"
             )

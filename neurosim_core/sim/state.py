@@ -1,5 +1,5 @@
 # mypy: disable-error-code="attr-defined,call-overload"
-"""The state of a run: the vehicles of all worlds, the buffers of their sensors, and the progress."""
+"""The state of a run: the vehicles of all worlds, the buffers of their sensors, and its progress."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import WorldSettings
 from neurosim_core.sim.render_group import PictureAllocator, RenderGroupState, make_render_groups
 from neurosim_core.sim.scene_table import single_scene
-from neurosim_core.sim.schedule import Boundary, Stretch
+from neurosim_core.sim.schedule import Stretch
 from neurosim_core.sim.trace import Trace, WorldArrays, make_surfaces
 from neurosim_core.vehicle import DynamicsError
 from neurosim_core.vehicle.base import Vehicle, VehicleContext
@@ -40,12 +40,12 @@ if TYPE_CHECKING:
     from neurosim_core.sim.cameras import RenderJob
 
 _IN_FLIGHT_ON_CUDA = 5
-"""With three, one batch is flown and one rendered while the host reads a third."""
+"""Batches in flight on CUDA. With three, one is flown and one rendered while the host reads a third."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StartState:
-    """Where an episode starts, with rotors at hover; what is None is as configured: the start of the path."""
+    """The state at the start of an episode, with rotors at hover. None: the start of the configured path."""
 
     position: ArrayLike | None = None
     """p_WB [m], shape [3]."""
@@ -59,33 +59,35 @@ class StartState:
 
 @dataclass(kw_only=True, eq=False)
 class Batch:
-    """A stretch of a run that was flown, and that cameras may have to render."""
+    """A stretch of a run that is launched as one unit: its motion, then its renders and scans."""
 
     stretch: Stretch
-    """What happens in it, relative to its begin."""
-    boundaries: Sequence[Boundary]
-    """The same at their stamps in the run."""
+    """The boundaries of the batch, relative to its begin."""
+    stamps_ns: Sequence[int]
+    """Stamps of its boundaries in the run [ns]."""
     closed_loop: bool
-    """The path controller commands."""
+    """The path controller commands; otherwise the last command is held."""
     step_count: int
-    """Steps of the integration."""
+    """Number of integration steps."""
     command_count: int
+    """Number of commands of the path controller."""
     number: int
-    """Counts the batches of a state."""
+    """Index of the batch, counted from the start of the state."""
     slot: int
     """Slot of the first boundary in the trace, and of its first sample in the arrays of each sampler."""
-    wanted: frozenset[str]
-    """Cameras that look."""
-    begins: Any
-    """Mask of the worlds that begin with it, device array of int32, shape [N]; None: they go on."""
+    enabled_cameras: frozenset[str]
+    """Cameras that are rendered."""
+    reset_mask: Any
+    """Worlds whose episode begins with this batch, device array of int32, shape [N]; None: none."""
     until_ns: int
-    """Packets up to here count [ns]: less than the whole batch where a collision ends the run."""
+    """Packets after this stamp are dropped [ns]. It is before the end of the batch if a collision ends the
+    run."""
     jobs: Sequence[RenderJob] | None = None
-    """The instants that groups render of it; None: not planned yet."""
+    """The renders of all groups; None: not planned yet."""
     left_out_count: int = 0
     """Ticks that adaptive groups do not render."""
     coarse_count: int = 0
-    """Renders after which something moves further by the next tick than it should between renders."""
+    """Renders after which a point moves further than `max_displacement_px` until the next tick."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -94,7 +96,7 @@ class State:
 
     world_count: int
     on_host: bool
-    """Packets go to the host; else results stay on the device."""
+    """Results go to the host as packets; else they stay on the device."""
     wall_s: dict[str, float]
     """Wall-clock time by phase [s]."""
     vehicle: Vehicle
@@ -103,42 +105,44 @@ class State:
     start: Any
     """Initial states of vehicles, one row for each world (`inputs.Start`)."""
     path_controller: PathController | None
-    """None: the path prescribes the motion."""
+    """Follows the path; None: the path prescribes the motion."""
     trace: Trace
     groups: list[RenderGroupState]
     samplers: dict[str, Sampler]
     sampler_copies: dict[str, dict[str, HostCopy]]
-    """Measurements of each sampler on the host, in the slots of the trace; empty: they stay on the device."""
+    """Host copies of the measurements of each sampler, in the slots of the trace; empty without `on_host`."""
     seeds: Any
     """Seed of each world, device array of uint64."""
     pipeline: Pipeline
-    """How batches share the device."""
+    """The streams, fences and graphs of the device."""
     borrow_pictures: bool
     """Pictures are views that the next batch with the same buffers overwrites."""
     pictures_in_place: bool
-    """Pictures for which the caller has a buffer are handed out before the device has finished them."""
-    wanted: frozenset[str]
-    """Cameras that look, from the next batch on."""
+    """Pictures in buffers of the caller are returned before the device has finished them (`settle` waits)."""
+    enabled_cameras: frozenset[str]
+    """Cameras that are rendered, from the next batch on."""
     stamp_ns: int = 0
     """Time up to which packets have been returned [ns]."""
     launched_ns: int = 0
     """Time up to which work has been launched [ns]."""
     launched_count: int = 0
-    """Batches flown so far."""
+    """Number of batches whose motion has been launched."""
     rendered_count: int = 0
-    """Batches that cameras have rendered, or left out; written by the thread that does."""
+    """Number of batches whose cameras were rendered or skipped; written by the thread that renders."""
     last: Odometry | None = None
-    """The state at the end of what was flown and read."""
+    """The vehicle's state at the last boundary that was read back."""
     controllers: dict[str, Controller] = field(default_factory=dict)
-    """Converters from setpoints to rotor speeds, of the command modes that were used."""
+    """Converters from setpoints to rotor speeds, by command mode, made at the first use of the mode."""
     commands: dict[str, CommandBuffer] = field(default_factory=dict)
-    """The setpoints of each mode that was used."""
+    """Setpoint buffers by command mode, made at the first use of the mode."""
     command_mode: CommandMode | None = None
-    """Mode of the setpoint that the next batch begins with."""
+    """Mode of the setpoint that the next batch takes; None: no new setpoint."""
     in_flight: deque[Batch] = field(default_factory=deque)
+    """Batches that are launched and not read, oldest first."""
     planned: Batch | None = None
-    """The first of the next control period, if it was planned while the device was at work."""
+    """The first batch of the next control period, if `prepare_step` has planned it."""
     sequence: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    """Sequence number of the next packet of each sensor."""
     touching: bool = False
     """The vehicle touched the scene at the last boundary."""
     ended: bool = False
@@ -146,8 +150,8 @@ class State:
     failure: DynamicsError | None = None
     """The integration failed; packets up to its stamp have been returned."""
     counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
-    """steps, commands, redone intervals (of the dynamics, in adaptive steps), renders, ticks left out, coarse
-    ticks, events dropped, collisions."""
+    """Counters of the run: steps, commands, redone intervals (integrated again with adaptive steps), renders,
+    ticks left out, coarse ticks, events dropped, collisions."""
 
 
 def make_state(
@@ -161,24 +165,24 @@ def make_state(
     start: StartState | None = None,
     worlds: WorldSettings | None = None,
 ) -> State:
-    """Allocate everything an episode needs, in one world whose packets go to the host, or in many.
+    """Allocate everything an episode needs, for one world with packets on the host, or for many worlds.
 
     Args:
-        model: What does not change.
-        in_flight: How many batches `run_model` keeps in flight. By default 5 on a CUDA device, and 1 where a
-            launch returns when it has finished. It changes no packet.
-        render_backlog: How many batches of `integrate_period` may wait for `render_batch`; by default
-            `in_flight`.
-        borrow_pictures: Do not copy pictures: with one batch in flight, each is valid until the next `step`
-            or `render_batch`; those that a step would overwrite itself are copied.
-        allocate_picture: Gives a buffer to copy a picture to, where the caller has one; called before
-            pictures are rendered. Nothing waits for what a device copies there: it is there after `settle`.
-        seed: Seed of the sensor noise and of turbulence; None: as configured.
-        start: Where the vehicle starts; None: as configured.
-        worlds: Many worlds whose results stay on the device, in place of one with packets.
+        model: The model of the run.
+        in_flight: Number of batches that `run_model` keeps in flight. By default 5 on a CUDA device, and 1
+            where launches are synchronous. It does not change the packets.
+        render_backlog: Number of batches of `integrate_period` that may wait for `render_batch`: at least
+            `in_flight`, which is the default.
+        borrow_pictures: Return pictures as views, without a copy. With one batch in flight, a picture is
+            valid until the next `step` or `render_batch`; pictures that the same step overwrites are copied.
+        allocate_picture: Returns a buffer of the caller for a picture, or None; called before pictures are
+            rendered. The device copies the picture there asynchronously: `settle` waits for the copies.
+        seed: Seed of sensor noise and turbulence; None: as configured.
+        start: Initial state of the vehicle; None: as configured.
+        worlds: Settings of many worlds, whose results stay on the device; None: one world with packets.
 
     Raises:
-        ValueError: The start is of a wrong shape or not finite.
+        ValueError: The start has a wrong shape or is not finite, or the path prescribes the motion.
     """
     config, device = model.config, model.device
     on_host = worlds is None
@@ -192,7 +196,7 @@ def make_state(
     vehicle: Any = _make_vehicle(model, worlds, seeds)
     is_prescribed = model.path.attitude is not None
     if is_prescribed and start is not None:
-        raise ValueError("path.kind poses says where an episode starts: give no start")
+        raise ValueError("path.kind poses prescribes the start of an episode: give no start")
     world_arrays = _make_world_arrays(vehicle)
     wall_s: dict[str, float] = defaultdict(float)
     ground = model.airframe.ground
@@ -254,20 +258,21 @@ def make_state(
             wall_s,
             in_flight=in_flight,
             flown_ahead=flown_ahead,
-            as_one=not on_host or (in_flight == 1 and allocate_picture is None and _is_one_graph(model)),
-            chooses=bool(model.schedule.sparse),
+            single_graph=not on_host
+            or (in_flight == 1 and allocate_picture is None and _is_one_graph(model)),
+            adaptive=bool(model.schedule.sparse),
         ),
         wall_s=wall_s,
         borrow_pictures=borrow_pictures,
         pictures_in_place=allocate_picture is not None,
-        wanted=frozenset(name for group in model.groups for name in group.names),
+        enabled_cameras=frozenset(name for group in model.groups for name in group.names),
     )
     reset_vehicles(model, state, wp.ones(count, dtype=wp.int32, device=device))
     return state
 
 
 def _in_flight(model: Model, asked: int | None, *, on_host: bool) -> int:
-    """Return how many batches are kept in flight; `asked`: see `make_state`."""
+    """Return the number of batches in flight; `asked` is the argument of `make_state`."""
     if any(getattr(sensor, "remembers", False) for sensor in model.config.sensors.values()):
         return 1
     if asked is not None:
@@ -277,7 +282,7 @@ def _in_flight(model: Model, asked: int | None, *, on_host: bool) -> int:
 
 
 def _is_one_graph(model: Model) -> bool:
-    """Return whether all launches of a batch can be one CUDA graph, if nothing else is in flight."""
+    """Return whether all launches of a batch can form one CUDA graph, if no other batch is in flight."""
     return _is_cuda(model) and not model.schedule.sparse and model.config.renderer.only_launches
 
 
@@ -286,7 +291,7 @@ def _is_cuda(model: Model) -> bool:
 
 
 def _path_controller(model: Model, worlds: WorldSettings) -> PathController:
-    """Return what follows the paths of all worlds."""
+    """Return the controller that follows the paths of all worlds."""
     return model.config.control.make(
         ControllerContext(
             airframe=model.airframe,
@@ -308,7 +313,7 @@ def _single_world(model: Model, seed: int | None) -> WorldSettings:
 
 
 def _history_length(model: Model, slot_count: int) -> int:
-    """Return how many boundaries are kept for cameras, whatever is flown ahead."""
+    """Return the number of boundaries that the history keeps for cameras, besides those flown ahead."""
     window_ns = max((group.window_ns for group in model.groups), default=0)
     return model.schedule.boundary_count_max(1e-9 * window_ns) + slot_count
 
@@ -332,7 +337,7 @@ def _make_vehicle(model: Model, worlds: WorldSettings, seeds: Any) -> Vehicle:
 
 
 def _make_start(worlds: WorldSettings, chosen: StartState | None, device: str) -> Any:
-    """Allocate what says where vehicles begin."""
+    """Allocate the initial states of all worlds."""
     rows: Mapping[str, Any] = begin_of_paths(worlds.scenes)
     start = Start()
     for name, configured in rows.items():
@@ -355,10 +360,7 @@ def _make_world_arrays(vehicle: Vehicle) -> Any:
 
 
 def reset_vehicles(model: Model, state: State, mask: Any) -> None:
-    """Put vehicles whose mask [N] is not 0 where they begin (`State.start`); launches only.
-
-    Rotors are at hover, time is 0.
-    """
+    """Reset vehicles whose mask [N] is not 0 to `State.start`, rotors at hover, time 0; launches only."""
     wp.launch(
         restart,
         dim=state.world_count,

@@ -1,15 +1,15 @@
-"""The data flow of the simulator, in one function: read `launch` first.
+"""The data flow of the simulator in one function. Read `launch` first.
 
     command -> integrate -> sample the state -> pose cameras -> render -> scan frames -> packets
 
-What does not change is in `model.py`, what does in `state.py`: arrays with a leading axis of worlds, of which
-a single run has one. A run is cut into batches (`schedule.py`). Within a batch the vehicles are integrated
-from boundary to boundary, and their states stay on the device (`integrate.py`, `trace.py`). Then every render
-group renders all its instants in one launch, every frame sensor scans them in one launch (`cameras.py`), and
-what goes to the host is read back once.
+`model.py` holds the data that stay constant during a run, `state.py` the data that change: arrays with a
+leading axis of worlds. A single run has one world. The schedule (`schedule.py`) cuts a run into batches.
+Within a batch, the vehicles are integrated from boundary to boundary, and their states stay on the device
+(`integrate.py`, `trace.py`). Then each render group renders all its instants in one launch, each frame sensor
+scans them in one launch (`cameras.py`), and the results are read back to the host once.
 
-How batches share a device (streams, graphs, several batches in flight) is in `runtime/pipeline.py`; it
-changes no result.
+`runtime/pipeline.py` decides how batches share a device (streams, graphs, several batches in flight). It does
+not change the results.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ from neurosim_core.warp_start import refuse_forked_process
 def launch(model: Model, state: State, batch: Batch) -> None:
     """Launch one batch, from the command to the events, without waiting for a device.
 
-    The batch says where the vehicles go, and which sensors are due there (`integrate.plan_batch`).
+    The batch lists the boundaries to integrate to and the sensors that are due there
+    (`integrate.plan_batch`).
     """
     refuse_forked_process()
     with state.pipeline.batch(batch.number):
@@ -63,22 +64,22 @@ def launch_flight(state: State, batch: Batch) -> None:
     command = take_command(state)
     key = (command.key, batch.slot, batch.closed_loop, batch.stretch.flight)
 
-    def fly() -> object:
-        held = command.launch()  # setpoints -> rotor speeds
+    def launch_motion() -> object:
+        keep_alive = command.launch()  # setpoints -> rotor speeds
         integrate(state, batch)  # motion, from boundary to boundary; state sensors sample on the way
         fetch_flight(state, batch)  # -> host
-        return held
+        return keep_alive
 
     with state.pipeline.flight(batch.number):
-        state.pipeline.run(Launches(key, fly))
+        state.pipeline.run(Launches(key, launch_motion))
 
 
 def launch_cameras(model: Model, state: State, batch: Batch) -> None:
-    """Launch what cameras see of a batch that flies: those that are wanted."""
+    """Launch the enabled cameras of a batch whose motion has been launched."""
 
-    def look(job: RenderJob) -> object:
+    def launch_render(job: RenderJob) -> object:
         views = pose_cameras(job)  # motion -> poses of cameras and bodies, at all instants
-        render(job, views)  # all instants of all worlds in one launch; then what is not ideal in pictures
+        render(job, views)  # all instants of all worlds in one launch; then the noise of pictures
         fetch_pictures(job)  # -> host
         return job.from_slots, job.to_slots
 
@@ -86,7 +87,7 @@ def launch_cameras(model: Model, state: State, batch: Batch) -> None:
     with state.pipeline.renders(batch.number):
         for job in jobs:
             acquire_picture_buffers(job)
-            state.pipeline.run(Launches(launch_key(job), partial(look, job)))
+            state.pipeline.run(Launches(launch_key(job), partial(launch_render, job)))
     with state.pipeline.scans(batch.number):
         for scan in plan_scans(state, batch):  # log radiance -> events
             state.pipeline.run(scan)
@@ -95,15 +96,15 @@ def launch_cameras(model: Model, state: State, batch: Batch) -> None:
 def read(
     model: Model, state: State, *, last: bool = False, meanwhile: Callable[[], None] | None = None
 ) -> list[Packet]:
-    """Wait for the oldest batch in flight and return what the sensors yield in it, in the order of time.
+    """Wait for the oldest batch in flight and return its packets in the order of time.
 
-    `state.stamp_ns` moves on to the end of the batch, or to where a collision ended the run (`ended`) or the
-    integration failed (`failure`). If it is the `last`, nothing is launched before the pictures have been
-    used: they may be borrowed, if that is wanted. `meanwhile`: see `read_cameras`.
+    `state.stamp_ns` moves on to the end of the batch, or to the stamp at which a collision ended the run
+    (`ended`) or the integration failed (`failure`). With `last`, the caller launches nothing before it has
+    used the pictures, so they may be views (`State.borrow_pictures`). `meanwhile`: see `read_cameras`.
     """
     batch = state.in_flight.popleft()
     with timed(state.wall_s, "read-back"):
-        state.pipeline.wait_flown(batch.number)
+        state.pipeline.wait_flight(batch.number)
         packets = read_flight(model, state, batch)  # may end the run before the end of the batch
     packets += read_cameras(state, batch, borrow=last and state.borrow_pictures, meanwhile=meanwhile)
     state.rendered_count += 1

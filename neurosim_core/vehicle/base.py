@@ -39,7 +39,7 @@ class VehicleContext:
 
 
 class VehicleConfig(BaseConfig):
-    """Settings that all vehicles have. A kind adds its `kind`, what it needs, `airframe` and `make`."""
+    """Base class of the settings of vehicles. Subclasses add `kind`, their fields, `airframe` and `make`."""
 
     kind: str
     """Under which name the class is registered."""
@@ -54,11 +54,11 @@ class VehicleConfig(BaseConfig):
 
     @property
     def title(self) -> str:
-        """Name for texts that people read."""
+        """Name of the vehicle in printed texts."""
         return self.kind
 
     def airframe(self) -> MultirotorConfig:
-        """Return what planners, controllers and IMUs take the vehicle for: mass, inertia, rotors, ranges."""
+        """Return the multirotor that planners, controllers and IMUs assume: mass, inertia, rotors, ranges."""
         raise NotImplementedError
 
     def make(self, context: VehicleContext) -> Vehicle:
@@ -71,11 +71,11 @@ class FlightKernel(NamedTuple):
 
     kernel: wp.Kernel
     inputs: Callable[[int], list[Any]]
-    """Returns its first inputs for spans of a length [ns]; those that say what is recorded follow."""
+    """Returns its first inputs for spans of a length [ns]; the inputs of the recording follow."""
 
 
 class Vehicle(Protocol):
-    """The vehicles of all worlds. What they do only launches, on a device."""
+    """The vehicles of all worlds. On a CUDA device, methods only launch kernels and copies."""
 
     config: MultirotorConfig
     """The multirotor that planners, controllers and IMUs assume."""
@@ -86,21 +86,21 @@ class Vehicle(Protocol):
     max_step_ns: int
     """Longest integration step [ns]."""
     arrays: MultirotorArrays
-    """The state; `rotor_speed_command` is written by others."""
+    """The state; controllers write `rotor_speed_command`."""
     terms: tuple[str, ...]
     """Optional terms that are compiled in."""
 
     def advance(self, duration_ns: int) -> None:
-        """Move all vehicles on by a duration [ns] under the commands that hold."""
+        """Integrate all vehicles for a duration [ns] with their present commands."""
 
     def begin(self, mask: Any) -> None:
-        """Take up the state that `arrays` have, where the mask, int32 of shape [N], is not 0."""
+        """Begin an episode at the state in `arrays`, for vehicles whose mask, int32 [N], is not 0."""
 
     def accelerate(self) -> None:
         """Compute the accelerations at the present state."""
 
     def flight_kernel(self, record: Any) -> FlightKernel | None:
-        """Return what moves all vehicles by equal spans, and records them; None: `advance` moves them.
+        """Return the kernel that moves all vehicles by equal spans, and records them; None: use `advance`.
 
         Args:
             record: Warp function that records the state of a vehicle; see `integrator.make_flight`.
@@ -108,10 +108,10 @@ class Vehicle(Protocol):
 
 
 class HostVehicle:
-    """Base of a vehicle whose motion is computed in Python: define `move` and `acceleration`.
+    """Base class of vehicles in plain Python. Define `move` and `acceleration`.
 
-    It flies on the CPU, one world after the other. What `move` returns for a world that is not finite holds
-    that world at its last good state, and ends a run with `DynamicsError`, as in all vehicles.
+    It runs on the CPU, one world after the other. If `move` returns numbers that are not finite, the world is
+    held at its last good state, and a run ends with `DynamicsError`, as for all vehicles.
     """
 
     terms: tuple[str, ...] = ()
@@ -121,7 +121,7 @@ class HostVehicle:
 
         Args:
             config: The multirotor that planners, controllers and IMUs assume.
-            context: What it is made for.
+            context: Context of `VehicleConfig.make`.
 
         Raises:
             ValueError: The device is not the CPU.
@@ -129,19 +129,19 @@ class HostVehicle:
         self.config, self.count, self.max_step_ns = config, context.count, context.max_step_ns
         self.device = wp.get_device(context.device)
         if self.device.is_cuda:
-            raise ValueError(f"{type(self).__name__} is computed in Python: it needs device: cpu")
+            raise ValueError(f"{type(self).__name__} runs in Python: it needs device: cpu")
         self.arrays = allocate_arrays(self.count, config.rotor_count, self.device)
         self._views = {name: getattr(self.arrays, name).numpy() for name in MultirotorArrays.vars}
 
     def move(
         self, state: MultirotorState, command: NDArray[np.float64], duration_s: float
     ) -> MultirotorState:
-        """Return the state of one world a while later.
+        """Return the state of one world after a duration.
 
         Args:
-            state: Of the vehicle, without the leading axis.
-            command: Rotor speeds that are commanded [rad/s], shape [R].
-            duration_s: How long they hold [s].
+            state: State of the vehicle, without the leading axis.
+            command: Rotor speed commands [rad/s], shape [R].
+            duration_s: Duration for which they hold [s].
         """
         raise NotImplementedError
 
@@ -149,13 +149,13 @@ class HostVehicle:
         """Return dv/dt in W [m/s^2] and dw/dt in B [rad/s^2] of one world, each of shape [3].
 
         Args:
-            state: Of the vehicle, without the leading axis.
-            command: Rotor speeds that are commanded [rad/s], shape [R].
+            state: State of the vehicle, without the leading axis.
+            command: Rotor speed commands [rad/s], shape [R].
         """
         raise NotImplementedError
 
     def advance(self, duration_ns: int) -> None:
-        """Move all vehicles on that are not held."""
+        """Integrate all vehicles that are not held."""
         views = self._views
         for world in np.flatnonzero(views["status"] == 0).tolist():
             now = self._row(world)
@@ -171,10 +171,10 @@ class HostVehicle:
                     views[name][world] = value
 
     def flight_kernel(self, record: Any) -> None:
-        """Python moves the vehicles."""
+        """Return None: `advance` moves the vehicles."""
 
     def begin(self, mask: Any) -> None:
-        """Nothing is kept beside the state."""
+        """Do nothing: there is no memory besides the state."""
 
     def accelerate(self) -> None:
         """Compute the accelerations at the present state."""

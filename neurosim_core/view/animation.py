@@ -38,7 +38,7 @@ def save_animation(recorded: Path, out: Path, *, rate_hz: float = 10.0) -> None:
         if not colored:
             raise ValueError(
                 f"an animation needs pictures in colour, and {recorded} has none: add a sensor {{kind: rgb}} "
-                f"to the flight, or save what there is for Rerun, as {out.with_suffix('.rrd')}"
+                f"to the flight, or save a file for Rerun, as {out.with_suffix('.rrd')}"
             )
         pictures = list(flight.packets(colored[0]))
         events = next((p for p in first.values() if isinstance(p, Events)), None)

@@ -179,15 +179,26 @@ def show_file(file: Path, *, web: bool, port: int = 0, open_browser: bool = True
     stop = threading.Event()
     with (
         stop_at_signals(stop),
-        RerunViewer(web=web, port=port, file=file, waiting=lambda: not stop.is_set()) as viewer,
+        RerunViewer(
+            web=web, port=port, file=None if web else file, waiting=lambda: not stop.is_set()
+        ) as viewer,
     ):
         if web:
             print(f"open {viewer.page_url}", flush=True)
+            _send(file, viewer.data_url)
             if open_browser and has_display():
                 webbrowser.open(viewer.page_url)
         while not stop.is_set() and viewer.check():
             time.sleep(_POLL_S)
     return 130 if stop.is_set() else 0
+
+
+def _send(file: Path, url: str) -> None:
+    """Send a file to a server: one that reads it itself keeps a core busy until it ends (Rerun 0.41)."""
+    sender = import_rerun().RecordingStream("neurosim", send_properties=False)
+    sender.connect_grpc(url)
+    sender.log_file_from_path(file)
+    sender.disconnect()  # returns when all has been sent
 
 
 def _executable() -> str:

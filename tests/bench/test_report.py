@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -87,6 +88,12 @@ def test_the_page_escapes_and_counts():
     assert '<b class="met">1 met</b>, <b class="missed">1 missed</b>' in page
     assert 'src="data:image/png;base64,cGljdHVyZQ=="' in page
     assert "Newton (1687)" in page
+
+
+def test_a_page_without_claims_does_not_speak_of_them():
+    page = html_page([replace(chapter(), claims=[])], {"flight-plot": ""})
+    assert page.count("<section") == 1
+    assert "claim" not in page
 
 
 def test_the_terminal_shows_every_digit_of_a_cell_and_every_claim():

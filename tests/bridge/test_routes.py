@@ -418,7 +418,7 @@ def test_settings_of_the_readme():
 
 def test_names_of_the_readme():
     """Every ROS topic of the table is one that a default route has, and the other way round."""
-    table_text = README.read_text().partition("## Routes")[2].partition("## Types of your own")[0]
+    table_text = README.read_text().partition("## Routes")[2].partition("## Your own types")[0]
     named = set(re.findall(r"`(/[a-z_/]+)`", table_text))
     for route in default_routes(DRONE):
         if route.direction == "call" or "transform" in route.cortex_topic or "/info" in route.cortex_topic:

@@ -105,7 +105,7 @@ def test_another_process_commands_the_same_bits(flown):
     ("wrong", "error", "said"),
     [
         ("nan", ValueError, "finite"),
-        ("mode", ValueError, "commands velocity: it cannot go over to position"),
+        ("mode", ValueError, "commands velocity: it cannot change to position"),
         ("none", TypeError, "CountingController.command must return a setpoint, got None"),
     ],
 )
@@ -117,5 +117,5 @@ def test_what_it_does_wrong_is_said(wrong, error, said):
 def test_on_a_device_it_is_refused(flown, monkeypatch):
     context = ControllerContext(airframe=flown[0].airframe, paths=[flown[0].path], device="cpu")
     monkeypatch.setattr("warp.get_device", lambda _: type("Device", (), {"is_cuda": True}))
-    with pytest.raises(ValueError, match="CountingController is computed in Python: it needs device: cpu"):
+    with pytest.raises(ValueError, match="CountingController runs in Python: it needs device: cpu"):
         CountingConfig().make(context)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 
 import h5py
 import numpy as np
@@ -63,15 +64,24 @@ def test_a_grating_has_its_frequency(tmp_path):
     assert stats.intervals.sum() == 9 * len(x)
 
 
-def test_the_page(tmp_path, capsys):
+def test_the_page(tmp_path, capsys, monkeypatch):
     pytest.importorskip("matplotlib")
     one, two = poisson(tmp_path / "a.raw"), poisson(tmp_path / "b.dat", rate_hz=20.0, on_share=0.5)
     assert cli.main(["compare", str(one), str(two), "--out", str(tmp_path / "page.png")]) == 0
     text = capsys.readouterr().out
     assert "a.raw" in text
     assert "32x24" in text
+    for heading in text.splitlines()[0].split()[-3:]:
+        assert f"{heading}: " in text  # says what it is
     assert cli.main(["compare", str(tmp_path), "--out", str(tmp_path / "folder.png")]) == 0
     assert capsys.readouterr().out.splitlines()[:-1] == text.splitlines()[:-1]  # a folder is its files
+    monkeypatch.setenv("COLUMNS", "500")  # or long paths would be folded
+    again = tmp_path / "again" / "a.raw"
+    again.parent.mkdir()
+    shutil.copy(one, again)
+    assert cli.main(["compare", str(one), str(again), str(two), "--out", str(tmp_path / "named.png")]) == 0
+    names = [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:4]]
+    assert names == [str(one), str(again), "b.dat"]  # those of one name by their paths
     picture = np.asarray(Image.open(tmp_path / "page.png").convert("L"))
     assert picture.shape == (900, 1400)
     assert (picture < 200).mean() > 0.02  # it is not empty

@@ -249,7 +249,7 @@ def test_windows_that_are_too_long_or_mostly_without_truth_are_said(tmp_path, ca
         data.Dataset(tmp_path / "a.h5", window_s=50)
     found = data.Dataset(tmp_path / "a.h5", window_s=0.03, fields=["events", "depth"])
     assert (len(found), found.skipped_count) == (3, 10)
-    assert "10 of 13 windows are left out" in caplog.text
+    assert "10 of 13 windows are skipped" in caplog.text
 
 
 def test_settings_may_be_named_by_their_file(tmp_path):

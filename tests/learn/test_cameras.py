@@ -194,7 +194,7 @@ def test_without_draws_nothing_is_made_for_them(make):
     env = make(drawn=NO_RANDOMISATION)
     assert not env.sim.optics(CAMERA)[2].numpy().any()
     assert "light_factor" not in env.parameters
-    with pytest.raises(ValueError, match="make them with own_light=True"):
+    with pytest.raises(ValueError, match="make them with per_world_light=True"):
         env.sim.light("exposure")
 
 
@@ -217,5 +217,5 @@ def test_lenses_that_cannot_be_drawn_are_said(make):
     lens = {"width": 8, "height": 8, "horizontal_fov_rad": 1.5}
     config = {"sensors": {"front": {"kind": "event_camera", "lens": lens}}}
     other = PinholeConfig(width=4, height=8, horizontal_fov_rad=1.5)
-    with pytest.raises(ValueError, match=r"lenses of 'front': give one at least, all of 8 x 8 px"):
+    with pytest.raises(ValueError, match=r"lenses of 'front': give at least one, all of 8 x 8 px"):
         ns.Simulation(config, lenses={"front": [other]})

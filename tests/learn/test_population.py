@@ -145,4 +145,4 @@ def test_where_no_cluster_runs_that_is_said(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr("ray.init", init)
     assert main(["learn", "hover", "--device", "cpu", "--out", str(tmp_path), "--ray"]) == 1
-    assert "no Ray cluster on this machine (`ray start --head` begins one)" in capsys.readouterr().err
+    assert "no Ray cluster on this machine (`ray start --head` starts one)" in capsys.readouterr().err

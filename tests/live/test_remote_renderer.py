@@ -112,7 +112,7 @@ def test_what_is_wrong_is_said():
     for topic, (render, said) in answers.items():
         with served(topic, render) as settings, pytest.raises(RemoteRendererError, match=said):
             rendered(opened(settings), ["rgb", "depth"])
-    with pytest.raises(RemoteRendererError, match="nobody renders on /test/absent"):
+    with pytest.raises(RemoteRendererError, match="no renderer serves /test/absent"):
         opened(RemoteRendererConfig(topic="/test/absent", timeout_s=0.2))
 
 

@@ -454,6 +454,14 @@ def test_a_program_that_does_not_close_leaves_all_that_it_wrote(tmp_path, then, 
         assert_same(list(flight.packets()), packets[:count])
 
 
+def test_no_thread_is_left_of_a_recording_that_is_closed(tmp_path):
+    """A thread that is alive when the interpreter ends may hold a lock for which the interpreter waits."""
+    before = threading.active_count()
+    for _ in range(20):
+        RecordingWriter(tmp_path / "f.h5", HEADER).close()
+        assert threading.active_count() <= before
+
+
 DISK = """
 import os, time
 from neurosim_core.record import hdf5

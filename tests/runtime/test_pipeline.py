@@ -58,7 +58,7 @@ class Run:
 
     def read(self, number: int) -> tuple[int, int]:
         """Wait for a batch, and return what came of it; its buffers are free then."""
-        self.pipeline.wait_flown(number)
+        self.pipeline.wait_flight(number)
         state = self.flown[number % self.pipeline.flown_ahead]
         self.pipeline.wait(number)
         return state, self.events[number % self.pipeline.in_flight]
@@ -81,7 +81,7 @@ def make(request, monkeypatch) -> Callable[..., Run]:
     install_pipeline(monkeypatch, device)
 
     def make_run(**options: Any) -> Run:
-        chosen = {"flown_ahead": options["in_flight"], "as_one": False, "chooses": False, **options}
+        chosen = {"flown_ahead": options["in_flight"], "single_graph": False, "adaptive": False, **options}
         return Run(device, Pipeline(device, dict.fromkeys(PHASES, 0.0), **chosen))
 
     return make_run
@@ -107,7 +107,7 @@ def test_batches_in_flight(make, in_flight):
 
 def test_a_batch_as_one_graph(make):
     """Nothing is launched before its end, and all of it comes again as one graph."""
-    run, found = make(in_flight=1, as_one=True), []
+    run, found = make(in_flight=1, single_graph=True), []
     for number in range(BATCH_COUNT):
         with run.pipeline.batch(number):
             run.flight(number)
@@ -126,7 +126,7 @@ def test_flights_ahead_of_the_cameras(make):
     for begin in range(0, BATCH_COUNT, 4):
         for number in range(begin, begin + 4):
             run.flight(number)
-            run.pipeline.wait_flown(number)
+            run.pipeline.wait_flight(number)
             states.append(run.flown[number % 4])
         for number in range(begin, begin + 4):
             run.look(number)
@@ -137,7 +137,7 @@ def test_flights_ahead_of_the_cameras(make):
 
 def test_what_is_rendered_may_depend_on_the_flight(make):
     """A choice is made of the flight of its batch, while the renders of those before may wait."""
-    run, found = make(in_flight=2, chooses=True), []
+    run, found = make(in_flight=2, adaptive=True), []
     for number in range(BATCH_COUNT):
         run.flight(number)
         seen: list[int] = []

@@ -126,7 +126,7 @@ RATE = {"__annotations__": {"rate_hz": float}, "rate_hz": 100.0}
 @pytest.mark.parametrize(
     ("members", "said"),
     [
-        (RATE, "OwnConfig must say the class of its packets, a subclass of ns.Packet: packet_type = "),
+        (RATE, "OwnConfig.packet_type must be a subclass of ns.Packet, got None: add `packet_type = "),
         ({**RATE, "packet_type": Loose}, r"Loose\.air: the array needs axes, such as Annotated\["),
         ({"packet_type": Height}, "OwnConfig needs a field `rate_hz: RateHz = 100.0`"),
     ],
@@ -138,7 +138,7 @@ def test_what_a_class_lacks_is_said_when_it_is_registered(members, said):
 
 
 def test_a_kind_has_one_name():
-    with pytest.raises(ValueError, match=r"'test_hight', and its field `kind` says 'test_height'"):
+    with pytest.raises(ValueError, match=r"'test_hight', but its field `kind` is 'test_height'"):
         ns.register("sensor", "test_hight")(HeightConfig)
 
 

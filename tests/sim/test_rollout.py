@@ -146,7 +146,7 @@ def test_a_run_that_was_broken_off_can_go_on(settings):
         packets.append(packet)
         if packet.stamp_ns == state.stamp_ns == 80_000_000:
             break
-    with pytest.raises(RuntimeError, match="broken off"):
+    with pytest.raises(RuntimeError, match="interrupted"):
         sim.advance(model, state, 96_000_000)
     last = packets[-1]
     packets += sim.run_model(model, state)
@@ -326,7 +326,7 @@ def hover(model: sim.Model) -> np.ndarray:
 
 
 def test_cameras_in_another_thread_yield_the_same(outside_model):
-    """`fly_period` and `see` give the packets of `step`, however far the flight is ahead."""
+    """`integrate_period` and `render_batch` give the packets of `step`, however far the flight is ahead."""
     model, command = outside_model, 1.01 * hover(outside_model)
     together = sim.make_state(model)
     expected = [p for _ in range(10) for p in sim.step(model, together, command)]
@@ -379,7 +379,7 @@ def fly_steps(model: sim.Model, state: sim.State, count: int, *, ahead: bool) ->
     packets: list[Packet] = []
     for number in range(count):
         begun = sim.begin_step(model, state, command)
-        with pytest.raises(RuntimeError, match="under way"):
+        with pytest.raises(RuntimeError, match="in flight"):
             sim.begin_step(model, state, command)
         packets += sim.end_step(model, state, begun)
         if ahead:
@@ -512,7 +512,7 @@ def test_a_device_writes_pictures_into_room_of_the_caller(settings, monkeypatch,
 
 
 def test_flying_further_than_the_cameras_can_follow_is_an_error(outside_model):
-    state = sim.make_state(outside_model, render_backlog=3)
+    state = sim.make_state(outside_model, in_flight=1, render_backlog=3)
     sim.integrate_period(outside_model, state, None)  # the start and one period
     assert sim.render_backlog_left(state) == 1
     sim.integrate_period(outside_model, state, None)
@@ -656,7 +656,7 @@ def test_gains_can_change_between_two_periods(outside_model):
 
 
 def test_what_was_measured_before_a_failure_is_returned(outside_model):
-    """`step` and `fly_period` return it, and raise when they are asked to go on."""
+    """`step` and `integrate_period` return it, and raise when they are asked to go on."""
     model = outside_model
     for fly_on in (sim.step, lambda *a: sim.integrate_period(*a)[0]):
         state = sim.make_state(model, render_backlog=32)

@@ -250,5 +250,5 @@ def test_what_cannot_be_thrown_is_said(room):
             throw(ball, dtype, count)
     with pytest.raises(ValueError, match="no bodies to throw"):
         throw({}, wp.vec3d, 0)
-    with pytest.raises(ValueError, match="colour, depth and events only"):
+    with pytest.raises(ValueError, match="throw_bodies: cameras that process their pictures"):
         throw(ball, wp.vec3d, 1, sensors=flow)

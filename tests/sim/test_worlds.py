@@ -202,7 +202,7 @@ def test_walks_that_cannot_be_shared(several, plain, textured, caplog):
         )
         for walk in ({}, {"candidate_lists": {}})
     ]
-    assert caplog.text.count("render.candidate_lists is left out") == 1
+    assert caplog.text.count("render.candidate_lists is not used") == 1
     commands = commands_of("rates", 3, 2)
     plainly, walking = (record(worlds, commands) for worlds in made)
     assert event_count(plainly) > 100
@@ -491,7 +491,7 @@ def test_a_step_allocates_nothing(plain):
         (
             {},
             {"event_capacity": 2**30},
-            r"more than 2\^31: give a smaller event_capacity, at most 1073741823",
+            r"exceed 2\^31 events: give an event_capacity of at most 1073741823",
         ),
         ({"vehicles": {"a": {}, "b": {}}}, {}, "one vehicle, got a, b"),
         ({"control": {"rate_hz": 120}}, {}, "rate_hz must divide control.rate_hz = 120"),
@@ -531,10 +531,10 @@ def test_models_that_were_made_before(plain, textured):
         with pytest.raises(ValueError, match=message):
             Simulation(settings(plain, **changes), worlds=2, models=models[:1])
     elsewhere = dataclasses.replace(models[1], device="cuda:7")
-    with pytest.raises(ValueError, match=r"models\[1\] is on cuda:7, and worlds are to be on cpu"):
+    with pytest.raises(ValueError, match=r"models\[1\] is on cuda:7, but the worlds are on cpu"):
         Simulation(config, worlds=2, models=[models[0], elsewhere])
     for none in ({"models": ()}, {"scenes": ()}, {"scenes": []}):
-        with pytest.raises(ValueError, match="must name one scene at least"):
+        with pytest.raises(ValueError, match="must have at least one scene"):
             Simulation(config, worlds=2, **none)
 
 
@@ -577,7 +577,7 @@ def test_more_than_32_bits_can_count(plain):
     """Said before anything is allocated: event buffers, and candidate lists."""
     lens = {"width": 640, "height": 480, "horizontal_fov_rad": 1.5}
     rig = {"front": {**RIG["front"], "lens": lens, "sampling_rate_hz": 100}}
-    with pytest.raises(ValueError, match="4096 worlds with room for 614400 events each"):
+    with pytest.raises(ValueError, match="4096 worlds with a capacity of 614400 events each"):
         Simulation(settings(plain, sensors=rig, control={"rate_hz": 100}), worlds=4096)
     walking = {**UNSHADOWED, "candidate_lists": {"face_count_max": 4096}}
     rig["front"]["lens"] = {**lens, "width": 128, "height": 128}
@@ -589,7 +589,7 @@ def test_wrong_calls(plain):
     worlds = Simulation(settings(plain), worlds=2)
     with pytest.raises(RuntimeError, match=r"reset\(\) must be called"):
         worlds.step()
-    with pytest.raises(ValueError, match="the first reset is of all"):
+    with pytest.raises(ValueError, match="the first reset must reset all worlds"):
         worlds.reset(mask=[True, False])
     worlds.reset()
     with pytest.raises(ValueError, match=r"mode 'rates' takes rows"):
@@ -601,7 +601,7 @@ def test_wrong_calls(plain):
     with pytest.raises(ValueError, match=r"orientation must not be 0"):
         worlds.reset(orientation=[0.0, 0.0, 0.0, 0.0])
     worlds.step(np.zeros(4))
-    with pytest.raises(ValueError, match="tick together every 20000000 ns, and it is 10000000 ns"):
+    with pytest.raises(ValueError, match="tick together, which is every 20000000 ns; it is 10000000 ns"):
         worlds.reset(mask=np.array([True, False]))  # rgb takes a picture every other step
     worlds.step(np.zeros(4))
     with pytest.raises(ValueError, match=r"seed must be uint64 of shape \[2\]"):

@@ -185,7 +185,7 @@ def test_worlds_follow_as_a_single_run_does(tmp_path):
     for world in range(3):
         assert seen.state.position.numpy()[world].tolist() == alone.position.tolist()
         assert seen.state.orientation.numpy()[world].tolist() == alone.orientation.tolist()
-    with pytest.raises(ValueError, match="followed whatever is commanded"):
+    with pytest.raises(ValueError, match="takes no commands"):
         worlds.step(np.zeros(4), "motor_speeds")
     with pytest.raises(ValueError, match="give no position"):
         worlds.reset(position=[0.0, 0.0, 1.0])

@@ -9,12 +9,16 @@ import signal
 import socket
 import subprocess
 import sys
+import time
+import urllib.parse
 import urllib.request
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rerun as rr
 from processes import SOON_S, children_of, gone, wait_for
+from rerun_file import read, scalars
 
 from neurosim_core.view import rerun_viewer
 from neurosim_core.view.rerun_viewer import RerunViewer, ViewerEnded
@@ -53,6 +57,45 @@ def test_it_listens_on_this_machine_only():
         recording.disconnect()
         assert not viewer.ended
     assert viewer.ended
+
+
+def test_a_served_file_is_all_there_and_costs_nothing_more(tmp_path):
+    """What another client is given; a server that reads the file itself used a core for as long as it ran."""
+    shown, saved = tmp_path / "shown.rrd", tmp_path / "saved.rrd"
+    logged = rr.RecordingStream("neurosim")
+    logged.save(shown)
+    for k in range(100):
+        logged.set_time("sim_time", duration=np.timedelta64(10 * k, "ms"))
+        logged.log("speed", rr.Scalars(k))
+    logged.disconnect()
+    code = "import sys; from pathlib import Path; from neurosim_core.view.rerun_viewer import show_file\n"
+    code += "show_file(Path(sys.argv[1]), web=True, open_browser=False)"
+    command = [sys.executable, "-c", code, shown]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as viewer:
+        assert viewer.stdout is not None
+        page = urllib.parse.urlsplit(viewer.stdout.readline().removeprefix("open "))
+        (url,) = urllib.parse.parse_qs(page.query)["url"]
+        (pid,) = children_of(viewer.pid)
+
+        def used_ticks() -> int:
+            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+            return int(fields[11]) + int(fields[12])
+
+        def idle() -> bool:
+            before = used_ticks()
+            time.sleep(0.5)
+            return used_ticks() - before <= 1
+
+        try:
+            wait_for(idle)
+            copy = [rerun_viewer._executable(), url.strip(), "--bind", "127.0.0.1", "--save", saved]
+            with subprocess.Popen(copy, env={**os.environ, "RERUN_APP_ONLY": "true"}) as client:
+                wait_for(lambda: saved.exists() and idle())
+                viewer.terminate()
+                assert client.wait(SOON_S) == 0
+        finally:
+            viewer.terminate()
+    assert scalars(read(saved), "/speed") == [(k * 10_000_000, [k]) for k in range(100)]
 
 
 def test_ports_differ():
