@@ -1,8 +1,8 @@
 """Reads a scene in a process of its own, while the one that asks imports its libraries.
 
 Both would hold Python's interpreter lock most of the time: threads take turns. So would those that decode
-pictures with the one that cuts triangles: the process forks for pictures. It forks before it reads the
-scene: afterwards the kernel would copy each shared page of memory that one of them writes to. Arrays come in a file
+pictures with the one that cuts triangles: the process forks for pictures. It forks before it reads the scene:
+afterwards the kernel would copy each shared page of memory that one of them writes to. Arrays come in a file
 without a name, which is mapped into memory.
 """
 
