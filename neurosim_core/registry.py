@@ -29,7 +29,12 @@ _BUILT_IN = {
     "vehicle": {"multirotor": "vehicle.multirotor"},
     "controller": {"se3": "control.base"},
     "scene": {"apartment": "scene.apartment", "hall": "scene.hall", "mesh": "scene.mesh"},
-    "renderer": {"warp": "render.renderer", "remote": "live.remote_renderer"},
+    "renderer": {
+        "warp": "render.renderer",
+        "pyrender": "render.pyrender_renderer",
+        "synthetic": "render.synthetic_renderer",
+        "remote": "live.remote_renderer",
+    },
     "sink": {"hdf5": "sinks", "cortex": "live.sink"},
     "noise": {"leak": "sensors.event_config"},
     "task": {"hover": "learn.tasks"},
