@@ -319,9 +319,9 @@ def _prepare(arguments: argparse.Namespace, module: str) -> Iterator[tuple[Simul
             Console(stderr=True).status("preparing: libraries"),  # on the screen before they are there
             ThreadPoolExecutor(max_workers=1) as aside,
         ):
-            from neurosim_core.warp_start import start_warp
+            from neurosim_core.warp_start import start_device
 
-            aside.submit(start_warp)
+            aside.submit(start_device, settings.get("device", "auto"))  # `make_model` reports errors
             config = load_settings(arguments)
             importlib.import_module(module)
         yield config, reader
