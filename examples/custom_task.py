@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import argparse
 
-import torch
-
 import neurosim_core as ns
+
+try:
+    import torch
+except ImportError as error:
+    raise SystemExit(f"this example needs PyTorch ({error}): pip install -e '.[learn]'") from None
 
 
 @ns.register("task", "climb")

@@ -11,6 +11,14 @@ import numpy as np
 
 import neurosim_core as ns
 
+try:
+    import ray.train.torch
+    import torch
+except ImportError as error:
+    raise SystemExit(
+        f"this example needs Ray and PyTorch ({error}): pip install -e '.[distributed]'"
+    ) from None
+
 LENS = {"width": 32, "height": 24, "horizontal_fov_rad": 1.5}
 CONFIG = {
     "duration_s": 1.0,
@@ -31,9 +39,6 @@ def voxel_and_depth(row: dict[str, Any]) -> dict[str, Any]:
 
 def train() -> None:
     """Train in one of the workers; PyTorch averages their gradients."""
-    import ray.train.torch
-    import torch
-
     net = ray.train.torch.prepare_model(ns.learn.DenseNet((0.7,), channels=4))
     optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
     shard = ray.train.get_dataset_shard("train")
@@ -52,8 +57,6 @@ def train() -> None:
 
 def main() -> dict[str, Any]:
     """Return the last loss of worker 0, and how many workers there were."""
-    import ray.train.torch
-
     with tempfile.TemporaryDirectory() as name, ns.data.cluster("local"):
         shards = Path(name, "shards")
         ns.data.write_shards(

@@ -22,7 +22,10 @@ LENS = ("width", "height", "fx", "fy", "cx", "cy")
 def render_process(topic: str, ready: Any, done: Any) -> None:
     """Run the other process: answer requests for frames with pyrender."""
     config = ns.load_config({"scene": SCENE})
-    scene = ns.upload_scene(config.scene.load(), config.render, device="cpu", renderer="pyrender")
+    try:
+        scene = ns.upload_scene(config.scene.load(), config.render, device="cpu", renderer="pyrender")
+    except RuntimeError as error:  # pyrender or OpenGL is missing
+        raise SystemExit(error) from None
     cameras: dict[ns.PinholeConfig, Any] = {}
 
     def render(request: Any) -> ns.Frames:
@@ -51,7 +54,8 @@ def main() -> tuple[int, list[str]]:
     process.start()
     try:
         while not ready.wait(0.1):
-            assert process.is_alive(), "the other process has ended"
+            if not process.is_alive():
+                raise SystemExit("the process that renders has ended")
         lens = {"width": 160, "height": 120, "horizontal_fov_rad": 1.2}
         sensors = {kind: {"kind": kind, "rate_hz": 20, "lens": lens} for kind in ("rgb", "depth")}
         config = {"duration_s": 0.2, "device": "cpu", "scene": SCENE, "sensors": sensors}

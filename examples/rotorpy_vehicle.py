@@ -11,9 +11,13 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from rotorpy.vehicles.multirotor import Multirotor
 
 import neurosim_core as ns
+
+try:
+    from rotorpy.vehicles.multirotor import Multirotor
+except ImportError as error:
+    raise SystemExit(f"this example needs RotorPy ({error}): pip install -e '.[dev]'") from None
 
 _NAMES = dict(zip(ns.vehicle.MultirotorState._fields, ("x", "v", "q", "w", "rotor_speeds"), strict=True))
 

@@ -13,6 +13,7 @@ if TYPE_CHECKING:  # isort: off
     from neurosim_core import (
         control as control,
         data as data,
+        io as io,
         learn as learn,
         packets as packets,
         random as random,

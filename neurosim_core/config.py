@@ -274,7 +274,10 @@ def load_config(
     Raises:
         ConfigError: The file cannot be read or is not YAML; a key is unknown; a value is of the wrong type or
             out of range. The message has one line for each error.
+        TypeError: The source is neither the name of a file nor settings.
     """
+    if not isinstance(source, str | Path | Mapping | SimulationConfig | None):
+        raise TypeError(f"settings are the name of a YAML file, a mapping or None, got {source!r}")
     origin = str(source) if isinstance(source, str | Path) else "config"
     raw = read_file(Path(source)) if isinstance(source, str | Path) else dict(source or {})
     patches = [nest(key, value) for key, value in (overrides or {}).items()]

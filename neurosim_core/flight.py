@@ -122,6 +122,7 @@ def fly(
 
     on_stop: list[Callable[[], object]] = []
     context = {"folder": folder, "stem": "flight", "model": model, "header": header_of(model)}
+    context["begin_s"] = begin
     with (
         stop_at_signals(stop, on_stop=lambda: [stop_waiting() for stop_waiting in on_stop]),
         Sinks(sinks, say=say, on_stop=on_stop, **context) as files,

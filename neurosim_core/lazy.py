@@ -5,9 +5,12 @@ from __future__ import annotations
 import ast
 import gc
 import importlib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from neurosim_core.garbage import pause_collection
 
 
 def homes_of(file: str) -> dict[str, tuple[str, str]]:
@@ -48,14 +51,14 @@ def lazy_names(
             raise AttributeError(f"module {package!r} has no attribute {name!r}, known: {', '.join(names)}")
         prepare()
         module, attribute = homes[name]
-        collects = gc.isenabled()
-        gc.disable()  # what imports make stays: to look through it takes a quarter of their time
-        try:
-            if module == package:  # a module of the package itself
-                return importlib.import_module(f"{module}.{attribute}")
-            return getattr(importlib.import_module(module), attribute)
-        finally:
-            if collects:
-                gc.enable()
+        if module == package:  # a module of the package itself
+            module, attribute = f"{module}.{attribute}", ""
+        is_new = module not in sys.modules
+        with pause_collection():
+            found = importlib.import_module(module)
+            if is_new and gc.get_freeze_count() == 0:  # else the program has frozen objects of its own
+                gc.freeze()
+                gc.unfreeze()  # moves all objects to the oldest generation, unseen
+        return getattr(found, attribute) if attribute else found
 
     return find, lambda: names, names

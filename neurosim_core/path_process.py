@@ -6,14 +6,14 @@ import dataclasses
 import pickle
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from neurosim_core.runtime.child import begin_child, end_child, start_child
 
 if TYPE_CHECKING:
-    from neurosim_core.frames import Vector3
     from neurosim_core.scene.freespace import FreeSpace, FreeSpaceConfig
+    from neurosim_core.scene.scene import Scene
     from neurosim_core.trajectory import Path, PathConfig
 
 
@@ -36,19 +36,19 @@ class PlanningProcess:
 
     def plan(
         self,
-        unseeded: FreeSpace,
+        scene: Scene,
         config: FreeSpaceConfig,
         flights: Sequence[tuple[PathConfig, float]],
         *,
-        inside_m: Vector3 | None,
+        mapped: Callable[[], FreeSpace],
     ) -> tuple[FreeSpace, list[Path]]:
         """Return what `choose_seed` does, and the path that `make_path` plans there for each flight.
 
         Args:
-            unseeded: See `choose_seed`.
+            scene: The scene to fly in; materials are not needed.
             config: See `choose_seed`.
             flights: Configuration of each path, and how long it is flown at least [s].
-            inside_m: See `choose_seed`.
+            mapped: Waits for the distance map; meanwhile the process builds the tree of the triangles.
 
         Raises:
             NotPlannedError: The process has ended, because there is no such path or for any other reason.
@@ -56,11 +56,12 @@ class PlanningProcess:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         try:
+            pickle.dump((scene.vertices, scene.faces.reshape(-1)), self._process.stdin, protocol=5)
+            self._process.stdin.flush()
+            unseeded = mapped()
             names = {field.name for field in dataclasses.fields(unseeded)} - {"arrays", "mesh", "device"}
             grid = {name: getattr(unseeded, name) for name in names}
-            triangles = unseeded.mesh.points.numpy(), unseeded.mesh.indices.numpy()
-            request = (grid, triangles, config, flights, inside_m)
-            pickle.dump(request, self._process.stdin, protocol=5)
+            pickle.dump((grid, config, flights, scene.inside_m), self._process.stdin, protocol=5)
             self._process.stdin.flush()
             seed_m, notes, paths = pickle.load(self._process.stdout)
         except (EOFError, OSError, pickle.UnpicklingError):
@@ -89,12 +90,13 @@ def main() -> None:
 
         start_warp()
         load_scipy()
-        grid, (points, indices), config, flights, inside_m = pickle.load(sys.stdin.buffer)
+        points, indices = pickle.load(sys.stdin.buffer)
         mesh = wp.Mesh(
             points=wp.array(points, dtype=wp.vec3, device="cpu"),
             indices=wp.array(indices, dtype=wp.int32, device="cpu"),
             bvh_constructor="median",  # built faster than others, and few points are asked for
         )
+        grid, config, flights, inside_m = pickle.load(sys.stdin.buffer)
         arrays = DistanceField()  # kernels that plan paths read no distances of the grid
         arrays.mesh = mesh.id
         unseeded = FreeSpace(**grid, arrays=arrays, mesh=mesh, device="cpu")

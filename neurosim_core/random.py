@@ -38,6 +38,14 @@ def stream_id(name: str) -> int:
     return zlib.crc32(name.encode())
 
 
+def mix_seed(seed: int, stamp_ns: int) -> int:
+    """Return a seed of 64 bits that differs for each stamp (finaliser of SplitMix64, Steele et al. 2014)."""
+    mixed = (seed + 0x9E3779B97F4A7C15 * (stamp_ns + 1)) % 2**64
+    mixed = ((mixed ^ (mixed >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
+    mixed = ((mixed ^ (mixed >> 27)) * 0x94D049BB133111EB) % 2**64
+    return mixed ^ (mixed >> 31)
+
+
 @wp.func
 def philox(counter: wp.vec4ui, key: wp.vec2ui) -> wp.vec4ui:
     """Return Philox 4x32-10 of a counter under a key."""

@@ -29,7 +29,12 @@ _BUILT_IN = {
     "vehicle": {"multirotor": "vehicle.multirotor"},
     "controller": {"se3": "control.base"},
     "scene": {"apartment": "scene.apartment", "hall": "scene.hall", "mesh": "scene.mesh"},
-    "renderer": {"warp": "render.renderer", "remote": "live.remote_renderer"},
+    "renderer": {
+        "warp": "render.renderer",
+        "pyrender": "render.pyrender_renderer",
+        "synthetic": "render.synthetic_renderer",
+        "remote": "live.remote_renderer",
+    },
     "sink": {"hdf5": "sinks", "cortex": "live.sink"},
     "noise": {"leak": "sensors.event_config"},
     "task": {"hover": "learn.tasks"},
@@ -67,6 +72,8 @@ def register(category: str, kind: str) -> Callable[[Registered], Registered]:
                 f"give {cls.__module__}.{cls.__qualname__} another"
             )
         own = getattr(cls, "model_fields", {}).get("kind")
+        if category not in ("noise", "task") and not isinstance(getattr(own, "default", None), str):
+            raise TypeError(f'{cls.__qualname__} needs a field `kind: Literal["{kind}"] = "{kind}"`')
         if own is not None and own.default != kind:
             raise ValueError(
                 f"{cls.__qualname__} is registered as {category} kind {kind!r}, but its field `kind` is "

@@ -18,7 +18,7 @@ from pydantic_core import (
 
 from neurosim_core.docstrings import field_docs
 from neurosim_core.registry import find, kinds
-from neurosim_core.settings_file import merge
+from neurosim_core.settings_file import ConfigError, merge
 
 _NO_NUMBER = PydanticCustomError("no_number", "must be a number")
 
@@ -26,9 +26,10 @@ _NO_NUMBER = PydanticCustomError("no_number", "must be a number")
 class BaseConfig(BaseModel):
     """A frozen group of settings.
 
-    Unknown keys, non-finite numbers and values out of range are refused with a `ValueError` (pydantic's
-    `ValidationError`) that names the key, the value and what is allowed. Subclasses document each field with
-    a docstring on the line after it; `neurosim run --print-config` prints these as comments.
+    Unknown keys, non-finite numbers and values out of range are refused with a `ConfigError` that names the
+    key, the value and what is allowed (`model_validate` raises pydantic's `ValidationError`). Subclasses
+    document each field with a docstring on the line after it; `neurosim run --print-config` prints these as
+    comments.
     """
 
     model_config = ConfigDict(
@@ -37,6 +38,23 @@ class BaseConfig(BaseModel):
         allow_inf_nan=False,
         validate_default=True,
     )
+
+    def __init__(self, **values: Any) -> None:
+        """Check the values of one group.
+
+        Raises:
+            ConfigError: A key is unknown, or a value is of the wrong type or out of range.
+        """
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            from neurosim_core.config_errors import describe_errors, explain
+
+            lines = explain(type(self), error)
+            raise ConfigError(describe_errors(type(self).__name__, lines, {}, {})) from None
+
+    # As of pydantic's own: groups within a group are checked without it, and errors keep their place.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
     @model_validator(mode="before")
     @classmethod

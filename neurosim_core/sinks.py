@@ -67,6 +67,8 @@ class SinkContext:
     """The model of the flight."""
     header: RecordingHeader
     """Header of a recording: settings, sensors and path."""
+    begin_s: float = field(default_factory=time.perf_counter)
+    """When the flight began, as `time.perf_counter` says [s]: its real-time factor counts from there."""
     on_stop: list[Callable[[], object]] = field(default_factory=list)
     """Functions that a signal handler calls to end the flight. A sink that waits for other processes adds a
     function that ends the wait."""
@@ -296,7 +298,8 @@ class Sinks:
         Args:
             settings: By name.
             say: Told what is left out or given up.
-            context: `folder`, `stem`, `model`, `header` and, where there is one, `on_stop` of `SinkContext`.
+            context: `folder`, `stem`, `model`, `header` and, where there are any, `begin_s` and `on_stop` of
+                `SinkContext`.
 
         Raises:
             OSError, ValueError: One cannot be opened.

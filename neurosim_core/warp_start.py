@@ -64,6 +64,35 @@ def start_warp() -> None:
     context.Module._compile = _compile_once(context.Module._compile)
 
 
+def find_device(name: str) -> str:
+    """Return the Warp name of a device setting: auto, cuda, cpu, cuda:0, ...
+
+    Raises:
+        ValueError: The device is not on this machine.
+        RuntimeError: This process was forked from one that had used a device.
+    """
+    start_warp()
+    known = [str(device) for device in wp.get_devices()]
+    if name == "auto":
+        return "cuda:0" if "cuda:0" in known else "cpu"
+    if name == "cuda":
+        name = "cuda:0"
+    if name not in known:
+        raise ValueError(
+            f"device {name!r} is not on this machine, known: {known}; cuda needs an NVIDIA GPU and its "
+            "driver (`nvidia-smi` lists it), and device: auto takes a GPU if there is one, else the CPU"
+        )
+    return name
+
+
+def start_device(name: str) -> Any:
+    """Allocate a number on the device of a setting, see `find_device`: the first one creates a CUDA context.
+
+    Most of that runs in the driver, without the GIL.
+    """
+    return wp.zeros(1, device=find_device(name))
+
+
 def has_kernels() -> bool:
     """Return whether kernels of a simulator are in the kernel cache; a first flight compiles them all."""
     start_warp()  # which says where the cache is

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ctypes.util
 import importlib.util
+import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -138,6 +140,32 @@ def test_a_renderer_in_another_process_conforms(monkeypatch):
     if ctypes.util.find_library("EGL") is None:
         pytest.skip("OpenGL without a display needs EGL")
     assert load("remote_renderer").main() == (10, [])
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "extra"),
+    [
+        ("custom_task", "torch", "learn"),
+        ("ray_train", "ray", "distributed"),
+        ("remote_renderer", "pyrender", "render"),
+        ("rotorpy_vehicle", "rotorpy", "dev"),
+    ],
+)
+def test_an_example_without_its_library_names_it_and_the_extra(name, module, extra, tmp_path):
+    (tmp_path / f"{module}.py").write_text(f"raise ImportError('No module named {module}')")
+    path = os.pathsep.join([str(tmp_path), str(EXAMPLES.parent)])
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / f"{name}.py"],
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    first, *more = done.stderr.splitlines()
+    assert done.returncode == 1
+    assert f"No module named {module}" in first
+    assert f"pip install -e '.[{extra}]'" in first
+    assert more == ["the process that renders has ended"] * (name == "remote_renderer")
 
 
 def test_tutorials_include_the_examples_that_they_speak_of():

@@ -19,7 +19,7 @@ FILES = {
 
 MISTAKES = {
     "rnu": "did you mean 'run'?",
-    "run --overwirte": "did you mean '--overwrite'?",
+    "run --overwirte": "did you mean '--overwrite'? `neurosim run --help` lists what there is",
     "run --duration four": "--duration: invalid float value: 'four'",
     "run scene.yaml": "`neurosim run --print-config > scene.yaml` makes one",
     "run house.glb": "house.glb: no such file; settings are YAML, in which a mesh is scene: {kind: mesh",
@@ -72,6 +72,12 @@ def test_mistakes_in_python_are_answered_as_well():
         _ = ns.load_confg
     with pytest.raises(ns.ConfigError, match="duration: unknown key; did you mean 'duration_s'"):
         next(iter(ns.run({"duration": 1.0})))
+    with pytest.raises(
+        ns.ConfigError, match=r"EventCameraConfig .*:\n  threshold_on: .* greater .*, got -1\Z"
+    ):
+        ns.EventCameraConfig(threshold_on=-1)
+    with pytest.raises(TypeError, match="the name of a YAML file, a mapping or None, got 3"):
+        ns.load_config(3)
     with pytest.raises(ValueError, match=r"unknown airframe 'humingbird', known: .*'hummingbird'"):
         ns.preset("humingbird")
     with pytest.raises(FileNotFoundError, match=r"no file nothing\.h5"):

@@ -22,6 +22,7 @@ from neurosim_core.io import open_events
 from neurosim_core.live.recorder import Recorder
 from neurosim_core.sensors.event_labels import LabelledEvents
 from neurosim_core.sinks import SinkConfig, SinkContext
+from neurosim_core.view import sinks as view_sinks
 
 
 @ns.register("sink", "test_list")
@@ -99,6 +100,23 @@ def settings(scene: dict[str, Any], **sinks: Any) -> ns.SimulationConfig:
 def recorded(folder: Path, name: str = "flight.h5") -> list[ns.Packet]:
     with ns.Recording(folder / name) as recording:
         return list(recording.packets())
+
+
+def test_the_overview_says_the_real_time_factor_of_the_report(scene, tmp_path, monkeypatch):
+    """Also where other sinks take long to open."""
+    said = []
+
+    def open_late(config: ListSinkConfig, context: SinkContext) -> ListSink:
+        time.sleep(1.0)
+        return ListSink(config, context)
+
+    monkeypatch.setattr(ListSinkConfig, "open", open_late)
+    monkeypatch.setattr(
+        view_sinks, "save_overview", lambda *_, **given: said.append(given["real_time_factor"])
+    )
+    sinks = {"slow": {"kind": "test_list"}, "overview": {"kind": "overview"}}
+    report = ns.fly(settings(scene, **sinks), tmp_path)
+    assert said == [pytest.approx(report.real_time_factor, rel=0.3)]  # of the time after the last packet
 
 
 def test_an_outside_sink_gets_what_the_recording_gets(scene, tmp_path):

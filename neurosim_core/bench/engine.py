@@ -29,12 +29,13 @@ from neurosim_core.scene.scene import Ambient, Material, Scene
 from neurosim_core.sensors.displacement import DisplacementRule
 from neurosim_core.sensors.event_config import EventCameraConfig, event_presets
 from neurosim_core.sensors.events import EventCamera
-from neurosim_core.sim.model import Model, find_device, make_model, refit
+from neurosim_core.sim.model import Model, make_model, refit
 from neurosim_core.sim.rollout import run_model, step
 from neurosim_core.sim.simulation import Simulation
 from neurosim_core.sim.state import StartState, make_state
 from neurosim_core.trajectory.shapes import FigureEightConfig, figure_eight
 from neurosim_core.vehicle import DynamicsError, Multirotor, MultirotorConfig, MultirotorState, preset
+from neurosim_core.warp_start import find_device
 
 Poses = tuple[NDArray[np.float32], NDArray[np.float32]]
 """p_WC [m], shape [K, 3], and q_WC, xyzw, shape [K, 4]."""

@@ -80,7 +80,9 @@ def _make(arguments: argparse.Namespace) -> int:
             progress.advance(task)
     missing = len(plan.missing())
     if missing:
-        console.print(f"interrupted; {missing} flights are missing: the same command goes on", style="yellow")
+        console.print(
+            f"interrupted; {_flight_count(missing)} missing: the same command goes on", style="yellow"
+        )
         return 130
     # Who flies changes no byte, and so is no part of the command.
     who = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -94,8 +96,12 @@ def _make(arguments: argparse.Namespace) -> int:
         windows = Dataset(plan.folder)
         count = len(write_shards((windows[k] for k in range(len(windows))), shards))
         console.print(f"{shards}/: {len(windows):,} windows in {count} shards")
-    console.print(f"{plan.folder}/: README.md, sheet.png, SHA256SUMS, {plan.flight_count} flights")
+    console.print(f"{plan.folder}/: README.md, sheet.png, SHA256SUMS, {_flight_count(plan.flight_count)}")
     return 0
+
+
+def _flight_count(count: int) -> str:
+    return f"{count} flight{'s' * (count != 1)}"
 
 
 def _flights(plan: DatasetPlan, arguments: argparse.Namespace, stopped: Callable[[], bool]) -> Iterator[int]:
@@ -124,6 +130,12 @@ def add_compare_parser(commands: argparse._SubParsersAction[argparse.ArgumentPar
     parser.set_defaults(command=_compare)
 
 
+_COLUMNS = (
+    "interval: median time between two events of a pixel; silent: pixels without events; cycles/px: mean\n"
+    "spatial frequency of 20 ms of events, higher where edges are sharper or noise is"
+)
+
+
 def _compare(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.table import Table
@@ -136,7 +148,7 @@ def _compare(arguments: argparse.Namespace) -> int:
     size = None if arguments.size is None else read_size(arguments.size)
     console = Console(soft_wrap=not sys.stdout.isatty())
     table = Table(box=None, pad_edge=False, header_style="dim")
-    columns = ("file", "pixels", "events", "s", "M/s", "brighter", "interval", "silent", "c/px")
+    columns = ("file", "pixels", "events", "s", "M/s", "brighter", "interval", "silent", "cycles/px")
     for name in columns:
         table.add_column(name, justify="left" if name == "file" else "right", overflow="fold")
     stats = []
@@ -155,14 +167,15 @@ def _compare(arguments: argparse.Namespace) -> int:
                 f"{one.event_count:,}",
                 f"{one.duration_s:.3f}",
                 f"{one.mean_rate_hz / 1e6:.3f}",
-                f"{one.on_share:.1%}",
+                f"{100 * one.on_share:.1f} %",
                 f"{one.median_interval_us / 1000.0:.3g} ms",
-                f"{one.silent_share:.1%}",
+                f"{100 * one.silent_share:.1f} %",
                 f"{one.centroid:.3f}",
             )
         status.update("drawing")
         draw_comparison(stats, arguments.out)
     console.print(table)
+    console.print(_COLUMNS, style="dim", highlight=False)
     print_notes((note for one in stats for note in one.notes), console)
     console.print(f"{arguments.out}", markup=False, highlight=False)
     return 0

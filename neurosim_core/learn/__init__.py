@@ -1,4 +1,4 @@
-"""Learning to fly: environments of many worlds for PyTorch, tasks, training, and what flies a policy.
+"""Learning to fly: environments of many worlds for PyTorch, tasks, training, and the deployment of policies.
 
 Needs the extra `learn`.
 """
@@ -24,11 +24,16 @@ if TYPE_CHECKING:  # isort: off
         evaluate_policy as evaluate_policy,
         teacher_actor as teacher_actor,
     )
+    from neurosim_core.learn.gym import make_numpy_env as make_numpy_env
+    from neurosim_core.learn.population import train_population as train_population
     from neurosim_core.learn.ppo import (
         Ppo as Ppo,
         PpoConfig as PpoConfig,
     )
     from neurosim_core.learn.randomisation import Randomisation as Randomisation
+    from neurosim_core.learn.rsl_rl import RslRlEnv as RslRlEnv
+    from neurosim_core.learn.sb3 import Sb3Env as Sb3Env
+    from neurosim_core.learn.skrl import SkrlEnv as SkrlEnv
     from neurosim_core.learn.surfaces import (
         Counts as Counts,
         LeakySurface as LeakySurface,

@@ -204,7 +204,7 @@ class Dagger:
             self._rows.copy_(rows)
             self.descent.step(rate)
         imitation, hint = (self._losses / config.updates).tolist()
-        return {"imitation": imitation, "hint": hint}
+        return {"imitation error": imitation, f"{self.env.task.hint} error": hint}
 
     def _loss(self) -> torch.Tensor:
         """Return the loss of the stretches that `_rows` names; adds to `_losses`."""

@@ -12,7 +12,7 @@ import os
 import torch
 from torch import distributed
 
-from neurosim_core.sim.model import find_device
+from neurosim_core.warp_start import find_device
 
 
 def rank() -> int:

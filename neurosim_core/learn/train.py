@@ -38,7 +38,8 @@ from neurosim_core.learn.randomisation import Randomisation
 from neurosim_core.learn.recurrent import RecurrentPpo, RecurrentPpoConfig
 from neurosim_core.learn.surfaces import SURFACES, LeakySurface, TimeSurface, surface_like
 from neurosim_core.learn.task import Task
-from neurosim_core.sim.model import Model, find_device
+from neurosim_core.sim.model import Model
+from neurosim_core.warp_start import find_device
 
 Say = Callable[[str], None]
 Trainer = Ppo | Dagger | RecurrentPpo

@@ -100,13 +100,15 @@ class SensorRates:
 def describe_status(
     status: SimulatorStatus,
     *,
+    phase: bool = True,
     rates_hz: Mapping[tuple[str, str], float] | None = None,
     lost: Mapping[tuple[str, str], int] | None = None,
 ) -> str:
     """Return a status as Markdown: the run, its vehicles, its sensors.
 
-    `rates_hz`: messages a second of simulated time [Hz], by vehicle and sensor, if known. `lost`: messages
-    that a viewer has not received, by vehicle and sensor, if known.
+    `phase`: say in which phase the run is, and why. `rates_hz`: messages a second of simulated time [Hz], by
+    vehicle and sensor, if known. `lost`: messages that a viewer has not received, by vehicle and sensor, if
+    known.
     """
     run = f"{status.mode}, {status.stamp_ns / NS_PER_S:.3f} s, {status.step_count:,} control periods"
     counts = f"{status.overrun_count:,} overruns, delayed by {status.slipped_ns / NS_PER_S:.3f} s"
@@ -117,7 +119,8 @@ def describe_status(
             f"step {_ms(status.step_median_ns)} (p99 {_ms(status.step_p99_ns)}), "
             f"late {_ms(status.late_median_ns)} (p99 {_ms(status.late_p99_ns)}), {counts}"
         )
-    lines = [f"**{status.phase}**{f': {status.reason}' if status.reason else ''}", run, counts]
+    lines = [f"**{status.phase}**{f': {status.reason}' if status.reason else ''}"] if phase else []
+    lines += [run, counts]
     vehicles = [
         {
             "vehicle": vehicle.name,

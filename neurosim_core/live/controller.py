@@ -331,6 +331,9 @@ def fly(config: SimulationConfig | None, *, vehicle: str | None, mode: str, dela
                     f"{simulation.control_rate_hz:g} Hz, of {_owner(node, source)}"
                 )
                 console.print(said)
+                if config is not None and (difference := _difference(config, announced)):
+                    text = f"the simulator has another scene, where the path may meet walls: {difference}"
+                    console.print(text, style="yellow", markup=False, soft_wrap=True)
             heard = _receive(statuses, _LOOK_S) if fleet.vehicles else None
             line.update(fleet.describe())
             text = ""
@@ -356,6 +359,15 @@ def _owner(node: Node, source: int) -> str:
         if any(publisher.source == source for publisher in record.publishers):
             return f"the {record.name} in process {record.pid}, domain {node.domain}"
     return f"a simulator in domain {node.domain}"
+
+
+def _difference(config: SimulationConfig, announced: SimulationConfig) -> str:
+    """Say how the scene of a configuration differs from that of a simulator; nothing if it does not."""
+    here, there = config.scene.model_dump(mode="json"), announced.scene.model_dump(mode="json")
+    keys = [key for key in here if here[key] != there.get(key)]
+    if "kind" in keys:
+        keys = ["kind"]
+    return ", ".join(f"scene.{key} is {there[key]}, here {here[key]}" for key in keys)
 
 
 def _receive(subscriber: Subscriber[T], timeout_s: float) -> tuple[T, Info] | None:

@@ -78,7 +78,7 @@ def serve(
                 simulator.status.on_status = line.show
                 code = simulator.run(stop)
             if line.last is not None:
-                console.print(Markdown(describe_status(line.last)))
+                console.print(Markdown(describe_status(line.last, phase=False)))  # which was said
             for vehicle in simulator.vehicles:
                 if count := vehicle.state.counts["redone intervals"]:
                     console.print(f"{vehicle.name}: adaptive steps replaced {count:,} fixed ones")

@@ -12,7 +12,7 @@ import os
 import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import scipy  # which imports its parts when they are used
@@ -20,11 +20,13 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.install import install_hint
+from neurosim_core.registry import register
 from neurosim_core.render.camera import Lens, PinholeConfig
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.render.lighting import bake_light
 from neurosim_core.render.ray_times import refuse_several
 from neurosim_core.render.refine import refine
+from neurosim_core.render.renderer import RendererConfig
 from neurosim_core.render.scene_arrays import auto_exposure
 from neurosim_core.scene.bodies import Body, BodyPoses, body_poses
 from neurosim_core.scene.materials import mean_albedo, pack_textures
@@ -277,3 +279,16 @@ def _open_context(pyrender: Any, width: int, height: int) -> Any:
         Error,
     ) as error:  # what a lack of OpenGL raises
         raise PyrenderError(f"OpenGL cannot be used ({error}). {_INSTALL_OPENGL}") from error
+
+
+@register("renderer", "pyrender")
+class PyrenderRendererConfig(RendererConfig):
+    """OpenGL, rgb and depth only."""
+
+    kind: Literal["pyrender"] = "pyrender"
+    scene_type = PyrenderScene
+    make = PyrenderRenderer
+
+    def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
+        """Light a scene and hand it to pyrender."""
+        return upload_pyrender_scene(scene, config, device=device, bodies=bodies)

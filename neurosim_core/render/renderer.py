@@ -11,11 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from neurosim_core.registry import find, kinds, register, registered
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.config import LightingConfig, RenderConfig
-from neurosim_core.render.pyrender_renderer import PyrenderRenderer, PyrenderScene, upload_pyrender_scene
 from neurosim_core.render.ray_times import RayTimes
 from neurosim_core.render.scene_arrays import SceneArrays
 from neurosim_core.render.scene_arrays import upload_scene as upload_warp_scene
-from neurosim_core.render.synthetic_renderer import SyntheticRenderer, SyntheticScene
 from neurosim_core.render.warp_renderer import ONE_WORLD, RenderWorlds, WarpRenderer
 from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.scene import Scene
@@ -113,36 +111,6 @@ class WarpRendererConfig(RendererConfig):
     def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
         """Bring a scene to a device."""
         return upload_warp_scene(scene, config, device=device, bodies=bodies)
-
-
-@register("renderer", "pyrender")
-class PyrenderRendererConfig(RendererConfig):
-    """OpenGL, rgb and depth only."""
-
-    kind: Literal["pyrender"] = "pyrender"
-    scene_type = PyrenderScene
-    make = PyrenderRenderer
-
-    def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
-        """Light a scene and hand it to pyrender."""
-        return upload_pyrender_scene(scene, config, device=device, bodies=bodies)
-
-
-@register("renderer", "synthetic")
-class SyntheticRendererConfig(RendererConfig):
-    """A test pattern at almost no cost, on CPU and CUDA; it does not show the scene."""
-
-    kind: Literal["synthetic"] = "synthetic"
-    scene_type = SyntheticScene
-    make = SyntheticRenderer
-    only_launches = True
-
-    def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
-        """Return what all test patterns of a run share."""
-        if bodies:
-            names = ", ".join(body.name for body in bodies)
-            raise ValueError(f"the renderer 'synthetic' sees no bodies, and there are some: {names}")
-        return SyntheticScene(scene=scene, config=config, device=device)
 
 
 def upload_scene(

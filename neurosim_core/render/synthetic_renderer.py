@@ -8,18 +8,20 @@ with the pose that they show, so that a receiver can tell which instant it sees:
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from neurosim_core.registry import register
 from neurosim_core.render.camera import Lens
 from neurosim_core.render.config import RenderConfig
 from neurosim_core.render.ray_times import refuse_several
-from neurosim_core.scene.bodies import BodyPoses
+from neurosim_core.render.renderer import RendererConfig
+from neurosim_core.scene.bodies import Body, BodyPoses
 from neurosim_core.scene.scene import Scene
 from neurosim_core.scene.srgb import srgb_to_linear
 
@@ -266,3 +268,20 @@ def _card(width: int, height: int) -> tuple[NDArray[np.uint8], NDArray[np.float3
     rgb[split:] = np.linspace(0, 255, width).astype(np.uint8)[:, None]
     depth = np.linspace(_DEPTH_NEAR_M, _DEPTH_FAR_M, width, dtype=np.float32)
     return rgb, np.repeat(depth[None], height, axis=0)
+
+
+@register("renderer", "synthetic")
+class SyntheticRendererConfig(RendererConfig):
+    """A test pattern at almost no cost, on CPU and CUDA; it does not show the scene."""
+
+    kind: Literal["synthetic"] = "synthetic"
+    scene_type = SyntheticScene
+    make = SyntheticRenderer
+    only_launches = True
+
+    def upload(self, scene: Scene, config: RenderConfig, *, device: str, bodies: Sequence[Body]) -> Any:
+        """Return what all test patterns of a run share."""
+        if bodies:
+            names = ", ".join(body.name for body in bodies)
+            raise ValueError(f"the renderer 'synthetic' sees no bodies, and there are some: {names}")
+        return SyntheticScene(scene=scene, config=config, device=device)

@@ -98,22 +98,22 @@ class Fence:
             self._behind.record_event(self._event)
 
     def wait(self) -> None:
-        """Let the host wait until the device has come here."""
+        """Block the host until the device has reached the fence."""
         if self._event is not None:
             wp.synchronize_event(self._event)
 
     def wait_on_stream(self) -> None:
-        """Let the present stream wait until the device has come here."""
+        """Make the current stream wait until the device has reached the fence."""
         if self._event is not None and self._device.stream is not self._behind:
             self._behind = self._device.stream
             self._behind.wait_event(self._event)
 
 
 class GraphCache:
-    """Sequences of launches, replayed as CUDA graphs when they come again; they must not allocate or wait.
+    """Replays repeated sequences of launches as CUDA graphs. The launches must not allocate or wait.
 
     Attributes:
-        dropped_count: Keys that were forgotten for others, as there is room for 512.
+        dropped_count: Number of keys that were evicted from the cache of 512 graphs.
     """
 
     def __init__(self, device: Any) -> None:

@@ -1,8 +1,9 @@
 """Reads a scene in a process of its own, while the one that asks imports its libraries.
 
 Both would hold Python's interpreter lock most of the time: threads take turns. So would those that decode
-pictures with the one that cuts triangles: the process forks for pictures. Arrays come in a file without a
-name, which is mapped into memory.
+pictures with the one that cuts triangles: the process forks for pictures. It forks before it reads the scene:
+afterwards the kernel would copy each shared page of memory that one of them writes to. Arrays come in a file
+without a name, which is mapped into memory.
 """
 
 from __future__ import annotations
@@ -160,19 +161,25 @@ def _read(settings: Mapping[str, Any], write: Callable[[int, object], None]) -> 
     given = {"kind": given} if isinstance(given, str) else given
     kind = scene_kind(given)
     config: SceneConfig = find("scene", kind).model_validate({"kind": kind, **given})  # type: ignore[attr-defined]
-    scene = load_mesh_scene(config, decode=False) if isinstance(config, MeshSceneConfig) else config.load()
-    write(_GEOMETRY, (config, dataclasses.replace(scene, materials=())))
-    textures = list(dict.fromkeys(m.texture for m in scene.materials if m.texture is not None))
     end_with_reader = end_with_parent(signal.SIGKILL)
+    receiving, sending = os.pipe()
     child = os.fork()
     if child == 0:
         try:
             if end_with_reader is not None:
                 end_with_reader()
-            with ThreadPoolExecutor() as threads:
+            os.close(sending)
+            with open(receiving, "rb") as source, ThreadPoolExecutor() as threads:
+                textures = pickle.load(source)
                 write(_PICTURES, (config, list(threads.map(lambda t: (t.srgb, t.pack_levels()), textures))))
         finally:
             os._exit(0)
+    os.close(receiving)
+    scene = load_mesh_scene(config, decode=False) if isinstance(config, MeshSceneConfig) else config.load()
+    write(_GEOMETRY, (config, dataclasses.replace(scene, materials=())))
+    textures = list(dict.fromkeys(m.texture for m in scene.materials if m.texture is not None))
+    with open(sending, "wb") as asking:
+        pickle.dump(textures, asking, protocol=5)
     from neurosim_core.render.config import RenderConfig
     from neurosim_core.render.refine import refine_within
 

@@ -25,6 +25,10 @@ if TYPE_CHECKING:  # isort: off
         NoiseTermConfig as NoiseTermConfig,
         SignalTerm as SignalTerm,
     )
+    from neurosim_core.sensors.kalibr import (
+        read_camchain as read_camchain,
+        write_camchain as write_camchain,
+    )
     from neurosim_core.sensors.state_sampler import (
         ErrorConfig as ErrorConfig,
         Errors as Errors,

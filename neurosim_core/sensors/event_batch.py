@@ -1,8 +1,8 @@
 # mypy: disable-error-code="attr-defined,arg-type"
-"""Event cameras that are fed one frame per call: a drop-in where frames come from elsewhere.
+"""Event cameras that take one frame per call, for frames from other sources.
 
 A call launches the scan of one frame of all cameras and waits for the number of events. Events stay on the
-device, unsorted, and are taken apart where somebody reads them.
+device, unsorted, and are decoded when they are read.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from neurosim_core.warp_start import start_warp
 
 _ROOM_MIN = 1024
 _PIXELS_PER_EVENT = 2
-"""Pixels for each event for which there is room in a call before any have come."""
+"""The initial capacity of a call is one event for this many pixels."""
 _LANES = 1 << 16
-"""Threads that take the events of all cameras apart, on CUDA."""
+"""Number of threads that decode the events of all cameras on CUDA."""
 
 
 class FrameEvents:
     """The events between two frames, on the device.
 
     Attributes:
-        start_ns: Time of the frame before [ns].
+        start_ns: Time of the previous frame [ns].
         stamp_ns: Time of the frame [ns].
-        counts: Events of each camera.
-        dropped_count: Events of all cameras that are lost: more than `event_count_max`.
+        counts: Number of events of each camera.
+        dropped_count: Number of lost events of all cameras, beyond `event_count_max`.
     """
 
     def __init__(
@@ -58,17 +58,17 @@ class FrameEvents:
 
     @property
     def offsets(self) -> NDArray[np.int32]:
-        """Offset of the first event of each camera, and the end, shape [N + 1]."""
+        """Index of the first event of each camera, and the number of events, shape [N + 1]."""
         return np.fromiter(itertools.accumulate(self.counts, initial=0), np.int32, len(self.counts) + 1)
 
     @property
     def columns(self) -> Sequence[Any]:
-        """Time [us], column, row and polarity as Warp arrays of shape [event], camera after camera.
+        """Time [us], column, row and polarity as Warp arrays of shape [event], ordered by camera.
 
         The order within a camera is not specified. `wp.to_torch` makes tensors of them without a copy.
 
         Raises:
-            RuntimeError: If they are read for the first time after the next frame.
+            RuntimeError: If the first read comes after the next frame.
         """
         if self._columns is None:
             if self._number != self._batch.frame_number:
@@ -85,19 +85,19 @@ class FrameEvents:
 
 
 class EventCameraBatch:
-    """N event cameras, each of which gives the events of an `EventCamera`, and which share one clock.
+    """N event cameras with a common clock. Each yields the events of an `EventCamera`.
 
-    Frames on the device are read where they are. What is launched goes to Warp's present stream, which waits
-    for CUDA's default stream: tensors that PyTorch computed on another stream must be waited for.
+    Frames on the device are read without a copy. Launches go to Warp's current stream, which waits for CUDA's
+    default stream; wait for tensors that PyTorch computes on other streams.
 
     Args:
-        config: Their pixels. There is no readout.
-        count: How many cameras.
-        width: Width of each [px].
-        height: Height of each [px].
+        config: Settings of the pixels, without a readout.
+        count: Number of cameras N.
+        width: Width of each camera [px].
+        height: Height of each camera [px].
         device: Warp device.
         sensor: Name of the sensors; noise depends on it.
-        seed: Seed of the first camera; those of the others follow it.
+        seed: Seed of camera 0; camera i has seed + i.
 
     Raises:
         ValueError: If the configuration has a readout.
@@ -115,7 +115,7 @@ class EventCameraBatch:
         seed: int = 0,
     ) -> None:
         if config.readout is not None:
-            raise ValueError("readout is for EventCamera.feed: events wait for each other on the host")
+            raise ValueError("readout is for EventCamera.feed only: the arbiter runs on the host")
         start_warp()
         self.device = wp.get_device(device)
         self._event_count_max = config.event_count_max
@@ -158,10 +158,10 @@ class EventCameraBatch:
         """Of the last frame, so that nobody reads the events of another."""
 
     def reset(self, log_radiance: Any, stamp_ns: int = 0) -> None:
-        """Start anew: every pixel's reference is its log radiance now.
+        """Reset all pixels: their reference is the given log radiance.
 
         Args:
-            log_radiance: As for `step`; it is copied.
+            log_radiance: See `step`; it is copied.
             stamp_ns: Time of this frame [ns].
 
         Raises:
@@ -179,13 +179,13 @@ class EventCameraBatch:
         self._stamp_ns = int(stamp_ns)
 
     def step(self, log_radiance: Any, stamp_ns: int) -> FrameEvents:
-        """Return the events between the frame before and this one, and wait until they are counted.
+        """Return the events between the previous frame and this one; waits until they are counted.
 
         Args:
             log_radiance: Natural logarithm of radiance, float32, shape [N, H, W], or [H, W] of one camera;
-                NumPy, Warp or any array of the device with `__cuda_array_interface__`. It may be changed
-                after this.
-            stamp_ns: Time of the frame [ns], later than that before.
+                NumPy, Warp or any array of the device with `__cuda_array_interface__`. The caller may
+                change it after the call.
+            stamp_ns: Time of the frame [ns], after that of the previous frame.
 
         Raises:
             RuntimeError: If there was no reset.
@@ -194,10 +194,10 @@ class EventCameraBatch:
         """
         start_ns = self._stamp_ns
         if start_ns is None:
-            raise RuntimeError("reset() must be called before a frame is fed")
+            raise RuntimeError("call reset() with a first frame before step()")
         if not 0 < stamp_ns - start_ns < self.span_max_ns:
             raise ValueError(
-                f"stamp_ns must be later than {start_ns}, that of the frame before, by less than "
+                f"stamp_ns must be later than {start_ns}, that of the previous frame, by less than "
                 f"{self.span_max_ns / 1e9:g} s, got {stamp_ns}"
             )
         address, held = self._locate(log_radiance)

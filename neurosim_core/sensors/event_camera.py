@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -22,10 +22,14 @@ from neurosim_core.sensors.base import (
     RenderRequest,
 )
 from neurosim_core.sensors.event_config import EventCameraConfig, describe_pixel
-from neurosim_core.sensors.event_labels import EventLabel, EventLabels, LabelledEvents
 from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS
 from neurosim_core.sensors.event_worlds import WorldEventCamera
 from neurosim_core.sensors.events import EventCamera
+
+if TYPE_CHECKING:
+    from neurosim_core.sensors.event_labels import EventLabels
+
+EventLabel = Literal["depth", "flow", "instance", "semantic", "cause"]
 
 _ROOM_MIN = 1024
 """Smallest default capacity for the events of one world in one step."""
@@ -68,7 +72,11 @@ class EventSensorConfig(FrameSensorConfig):
     @property
     def packet_class(self) -> type[Events]:
         """`LabelledEvents` with labels, else `Events`."""
-        return LabelledEvents if self.labels else Events
+        if not self.labels:
+            return Events
+        from neurosim_core.sensors.event_labels import LabelledEvents
+
+        return LabelledEvents
 
     @property
     def look_back_ns(self) -> int:
@@ -161,11 +169,11 @@ class EventChannel(FrameSensor):
     def __init__(self, config: EventSensorConfig, context: FrameContext) -> None:
         terms = config.pixel.terms()
         has_cause = "cause" in config.labels and bool(terms)  # of ideal pixels it is the signal
-        self._labels = (
-            EventLabels(config.labels, config.classes, context, has_cause=has_cause)
-            if config.labels
-            else None
-        )
+        self._labels: EventLabels | None = None
+        if config.labels:
+            from neurosim_core.sensors.event_labels import EventLabels
+
+            self._labels = EventLabels(config.labels, config.classes, context, has_cause=has_cause)
         self._camera = EventCamera(
             config.pixel,
             width=context.lens.width,

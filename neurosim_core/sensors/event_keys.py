@@ -26,10 +26,10 @@ from neurosim_core.runtime.cuda import (
 from neurosim_core.sensors import event_kernels
 from neurosim_core.sensors.event_kernels import COLUMN_OFFSETS, COLUMN_TYPES, EVENT_BYTES
 from neurosim_core.sensors.event_levels import SUB_BITS, KeyLayout
-from neurosim_core.sensors.event_readout import Readout, by_nanosecond
 
 if TYPE_CHECKING:
     from neurosim_core.sensors.event_labels import EventLabels
+    from neurosim_core.sensors.event_readout import Readout
 
 _KEYS_PER_PIXEL_ON_CPU, _KEYS_PER_PIXEL_ON_CUDA = 16, 4
 """Events for which there is room before any have come: pages that nobody touched cost nothing on a CPU."""
@@ -168,6 +168,8 @@ class EventKeys:
         if count == 0 and readout.waiting_count == 0:
             return arrivals
         if count > 0:
+            from neurosim_core.sensors.event_readout import by_nanosecond
+
             self._launch(by_nanosecond, count, [self.keys, first, self._time_shift], [self._spare])
             self._sort(self._spare, count)
             arrivals = self._spare[:count].numpy()

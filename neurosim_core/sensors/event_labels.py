@@ -18,7 +18,7 @@ import functools
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import warp as wp
@@ -34,7 +34,6 @@ from neurosim_core.sensors.base import FrameContext
 from neurosim_core.sensors.event_noise_model import CAUSE_BITS, CAUSES
 from neurosim_core.vehicle.history import History, motion_at
 
-EventLabel = Literal["depth", "flow", "instance", "semantic", "cause"]
 _FAR_M = wp.constant(1.0e9)
 _WORDS = 5
 """Numbers of 32 bits that the labels of an event take."""
@@ -183,7 +182,7 @@ class EventLabels:
 
     def __init__(
         self,
-        labels: Sequence[EventLabel],
+        labels: Sequence[str],
         classes: Mapping[str, Sequence[str]] | None,
         context: FrameContext,
         *,

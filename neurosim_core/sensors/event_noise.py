@@ -99,14 +99,6 @@ def _draw_pixels(
         model.rates[pixel] = wp.vec2d(shot, wp.where(hot, spread.hot_rate, _ZERO))
 
 
-def mix_seed(seed: int, stamp_ns: int) -> int:
-    """Return a seed of 64 bits that differs for each stamp (finaliser of SplitMix64, Steele et al. 2014)."""
-    mixed = (seed + 0x9E3779B97F4A7C15 * (stamp_ns + 1)) % 2**64
-    mixed = ((mixed ^ (mixed >> 30)) * 0xBF58476D1CE4E5B9) % 2**64
-    mixed = ((mixed ^ (mixed >> 27)) * 0x94D049BB133111EB) % 2**64
-    return mixed ^ (mixed >> 31)
-
-
 def _read_noise(config: MeasuredNoiseConfig) -> tuple[Any, Any, Any]:
     """Return light [lux], shape [L], medians and spread by light, [L, 3], and rates of pixels, [L, P, 2].
 

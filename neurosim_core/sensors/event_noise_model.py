@@ -113,25 +113,25 @@ _SIGNAL = (SignalTerm, wp.uint64, wp.int32, wp.int64, wp.float64)
 
 
 class NoiseTermConfig(BaseConfig):
-    """A deviation of pixels from the ideal; a package registers its own as `noise`, by kind.
+    """Base class of the settings of noise terms. Plug-ins register theirs in the category `noise`.
 
-    A term of another package changes what a pixel sees: it extends this class by its `kind`, its keys,
-    `numbers` and `signal`, and is asked for under `noise` of the pixel. It acts on log radiance after
-    `lin_log` and before the photoreceptor; of several, in the alphabetical order of their kinds.
+    A term of a plug-in changes the input of a pixel. It adds `kind`, its fields, `numbers` and `signal` to
+    this class, and settings list it under `noise` of the pixel. It acts on log radiance after `lin_log` and
+    before the photoreceptor; several terms act in the alphabetical order of their kinds.
     """
 
     compiled: ClassVar[tuple[str, ...]] = ()
-    """Some of `TERMS` that are compiled in for it; none: `signal` is, under its kind."""
+    """Built-in terms that it needs, a subset of `TERMS`; empty: `signal` is compiled."""
     signal: ClassVar[Any] = None
-    """Device function (`wp.func`): from a `SignalTerm`, the seed of numbers that change with time (uint64),
-    the index of the pixel, row by row (int32), the time since the reset [ns] (int64) and log radiance
-    (float64) to what the pixel sees at that time (float64). Between two frames that is linear in time.
-    A number that meets a float64 is written `wp.float64(0.5)`: Warp converts none.
-    Random numbers are addressed: `random_bits(seed, term.stream, since_reset_ns, pixel)` for what changes
-    with every frame, `random_bits(term.seed, term.stream, 0, pixel)` for what stays."""
+    """Device function (`wp.func`) that returns the input of the pixel (float64). Its parameters are a
+    `SignalTerm`, the seed of numbers that change with time (uint64), the row-major index of the pixel
+    (int32), the time since the reset [ns] (int64) and log radiance (float64). Its result is linear in time
+    between two frames. Warp does not convert numbers: write `wp.float64(0.5)` in float64 expressions.
+    Random numbers: `random_bits(seed, term.stream, since_reset_ns, pixel)` differs for every frame,
+    `random_bits(term.seed, term.stream, 0, pixel)` is constant in a run."""
 
     def numbers(self, white_radiance: float) -> tuple[float, ...]:
-        """Return what `SignalTerm.numbers` holds, at most four.
+        """Return the values of `SignalTerm.numbers`, at most four.
 
         Args:
             white_radiance: Radiance that counts as white (`EventCameraConfig.white_radiance`).
@@ -139,15 +139,15 @@ class NoiseTermConfig(BaseConfig):
         return ()
 
     def terms(self) -> tuple[str, ...]:
-        """Return the names of what is compiled in."""
+        """Return the names of the compiled terms."""
         return self.compiled or (type(self).model_fields["kind"].default,)
 
     @classmethod
     def check_class(cls) -> None:
-        """Refuse a term of which there is nothing to compile.
+        """Check the class when it is registered.
 
         Raises:
-            TypeError: `signal` is missing, or takes something else.
+            TypeError: `signal` is missing or has wrong parameters, or there is no field `kind`.
         """
         if cls.compiled:
             return

@@ -15,16 +15,14 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from neurosim_core.random import mix_seed
 from neurosim_core.render.launch import core_count, share
 from neurosim_core.runtime.cuda import Fence, HostCopy, HostInput
 from neurosim_core.sensors import event_kernels, event_scan
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_keys import keys_at_first
 from neurosim_core.sensors.event_levels import make_layout
-from neurosim_core.sensors.event_noise import make_model, mix_seed
 from neurosim_core.sensors.event_noise_model import CAUSE, CAUSE_BITS, PixelModel
-from neurosim_core.sensors.event_noise_pixel import make_begin, signal_terms
-from neurosim_core.sensors.event_noise_scan import make_noisy_scan
 from neurosim_core.sensors.event_scan import ALL, BLOCK_SIZE, COUNT, PixelState, Stack
 from neurosim_core.warp_start import refuse_forked_process
 
@@ -113,7 +111,10 @@ class PixelStates:
         self._models: Any = None
         self._scan: Any = event_scan.scan
         modules = [event_kernels, event_scan]
-        if self.terms:
+        if self.terms:  # ideal pixels do without the kernels of noise
+            from neurosim_core.sensors.event_noise_pixel import make_begin, signal_terms
+            from neurosim_core.sensors.event_noise_scan import make_noisy_scan
+
             self._scan = make_noisy_scan(frozenset(self.terms))
             self._begin_noise = make_begin(signal_terms(self.terms))
             modules += [self._scan.module, self._begin_noise.module]
@@ -139,6 +140,8 @@ class PixelStates:
         """
         if not self.terms:
             return
+        from neurosim_core.sensors.event_noise import make_model
+
         self._seeds = [*seeds]
         models = [*self.models] or [None] * len(seeds)
         for world in range(len(seeds)) if worlds is None else worlds:

@@ -26,10 +26,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from neurosim_core.clock import NS_PER_US
-from neurosim_core.random import normal2, random_bits, stream_id
+from neurosim_core.random import mix_seed, normal2, random_bits, stream_id
 from neurosim_core.sensors.event_config import ReadoutConfig
 from neurosim_core.sensors.event_levels import SUB_BITS, KeyLayout
-from neurosim_core.sensors.event_noise import mix_seed
 
 wp.set_module_options({"enable_backward": False})
 

@@ -25,15 +25,15 @@ _SORT_BLOCK_SIZE = 1024
 """Threads that sort the events of a world, where there may be many."""
 _MANY_EVENTS = 8192
 _OFFSETS_MAX = 4096
-"""Most lists of offsets that are remembered."""
+"""Largest number of cached lists of offsets."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WorldEvents:
     """The events of a step in all worlds, on the device, valid until the next step or reset.
 
-    Those of world i are [offsets[i], offsets[i + 1]); beyond the end of the last the arrays have no meaning.
-    They are sorted by (t, y, x, polarity) within each world, unless `Simulation(sorted=False)`.
+    World i has the slice `offsets[i]:offsets[i + 1]`; elements after the last slice are undefined. Events are
+    sorted by (t, y, x, polarity) within each world, unless `Simulation(sorted=False)`.
     """
 
     t: wp.array[wp.int64]
@@ -45,15 +45,15 @@ class WorldEvents:
     polarity: wp.array[wp.uint8]
     """1: brighter, 0: darker, shape [room]."""
     offsets: wp.array[wp.int32]
-    """Offset of the first event of each world, and the end, shape [N + 1]."""
+    """Index of the first event of each world, and the number of events, shape [N + 1]."""
     counts: wp.array[wp.int32]
-    """Events of each world, shape [N]."""
+    """Number of events of each world, shape [N]."""
     dropped: wp.array[wp.int32]
-    """Events of each world that did not fit and are lost, shape [N]."""
+    """Number of lost events of each world, beyond the capacity, shape [N]."""
     counters: wp.array2d[wp.int64]
-    """Of each world, of its last step, or of its reset before the first: events; values of log radiance that
-    were not finite or beyond +-1000, whose pixels kept their last value, or began at 0; and how many values
-    there are from the first of these on, shape [N, 3]."""
+    """Counters of the last step or reset of each world, shape [N, 3]: events; invalid values of log radiance
+    (not finite or beyond +-1000; such pixels keep their last value, or begin at 0); and the number of values
+    from the first invalid one to the end."""
     width: int
     """Width of the sensor [px]."""
     height: int
@@ -69,27 +69,27 @@ class WorldEvents:
 
 
 class WorldEventCamera(FrameSensor):
-    """Finds the events of one camera of the rig in all worlds.
+    """One event camera of the rig in all worlds.
 
-    Each world gives the events that an `EventCamera` gives alone, also where there are too many: of a step
-    with more than `capacity` events each of its K renders keeps `capacity / K` at most, the rows from the top
-    that fit, and the others are counted in `dropped`.
+    Each world yields the events of a single `EventCamera`. In a step with more than `capacity` events, each
+    of its K renders keeps at most `capacity / K` events, those of the upper rows that fit; the others are
+    counted in `dropped`.
 
     Args:
         configs: The pixels of each world.
         width: Width of the sensor [px].
         height: Height of the sensor [px].
-        instant_count: K, the most frames of a world in one step.
-        device: Where frames and events are.
-        capacity: Room for events of one world in one step.
+        instant_count: K, the largest number of frames of a world in one step.
+        device: Warp device of frames and events.
+        capacity: Capacity for events of one world in one step.
         sensor: Name of the sensor: noise depends on it.
         seeds: Seed of each world.
         clock_ns: Time of each world at the end of a step [ns], int64, shape [world]; for `plan`.
         ordered: Sort the events of each world.
-        decodes: Have room for `results`; False: somebody else reads the keys.
+        decodes: Allocate `results`; False: the caller reads the keys.
 
     Attributes:
-        present: Which of the two states of the pixels is the present one; the other is that after a scan.
+        present: Index of the current one of two pixel states; a scan writes the other.
     """
 
     def __init__(

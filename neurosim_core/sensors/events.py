@@ -29,11 +29,11 @@ from neurosim_core.sensors.event_batch import EventCameraBatch, FrameEvents
 from neurosim_core.sensors.event_config import EventCameraConfig
 from neurosim_core.sensors.event_keys import EventKeys, LostEvents
 from neurosim_core.sensors.event_pixels import Pixels, PixelStates, Scan
-from neurosim_core.sensors.event_readout import Readout
 from neurosim_core.warp_start import start_warp
 
 if TYPE_CHECKING:
     from neurosim_core.sensors.event_labels import EventLabels
+    from neurosim_core.sensors.event_readout import Readout
 
 _log = logging.getLogger(__name__)
 
@@ -150,7 +150,11 @@ class EventCamera:
         self._idle = deque(self._make_scan(16) for _ in range(scan_count))
         self._in_flight: deque[Scan] = deque()
         arbiter: dict[str, Any] = {"height": height, "layout": states.layout, "seed": seed, "sensor": sensor}
-        self._readout = None if config.readout is None else Readout(config.readout, **arbiter)
+        self._readout: Readout | None = None
+        if config.readout is not None:
+            from neurosim_core.sensors.event_readout import Readout
+
+            self._readout = Readout(config.readout, **arbiter)
         size: dict[str, Any] = {"width": width, "height": height, "device": device}
         new_stepper = functools.partial(EventCameraBatch, config, count=1, sensor=sensor, seed=seed, **size)
         self._make_stepper = functools.cache(new_stepper)

@@ -106,12 +106,12 @@ def _normal3(seed: wp.uint64, stream: wp.uint32, k: wp.int64, element: int) -> w
 
 
 class LateConfig(StateSensorConfig):
-    """A state sensor whose samples come late, or not at all."""
+    """Settings of a state sensor with delay and dropouts."""
 
     rate_hz: RateHz = 100.0
     """Sample rate [Hz]."""
     delay_s: Annotated[float, Field(ge=0.0, le=60.0)] = 0.0
-    """Time from measurement to delivery, which is at the stamp [s]; a multiple of 1 / rate_hz."""
+    """Time from the measurement to its delivery at the stamp [s]; a multiple of 1 / rate_hz."""
     dropout_probability: Probability = 0.0
     """Probability that a sample is not delivered."""
 
@@ -125,7 +125,7 @@ class LateConfig(StateSensorConfig):
         if abs(self.delay_count - self.delay_s * self.rate_hz) > 1e-6:
             raise ValueError(
                 f"delay_s must be a multiple of 1 / rate_hz = {1 / self.rate_hz:g}, got {self.delay_s:g}: "
-                "samples are of states at ticks of the sensor"
+                "the sensor measures at its ticks only"
             )
         return self
 
@@ -154,9 +154,9 @@ class Sampling:
 
 @functools.cache
 def error_adder(terms: tuple[str, ...]) -> Any:
-    """Return the function that adds errors to a measurement, those in `terms`.
+    """Return a Warp function that adds the errors in `terms` to a measurement.
 
-    Its parameters: the errors; the measurement; `Sampling`, the world, and the group of errors.
+    Its parameters are the errors, the measurement, `Sampling`, the world, and the index of the errors.
     """
 
     @wp.func
@@ -258,10 +258,10 @@ def _delay(motion: Motion, ring: Motion, length: int, at: Sampling):
 
 
 class StateSampler(Sampler):
-    """A state sensor of one kernel.
+    """A state sensor that launches one kernel.
 
-    The kernel's parameters are the inputs, `Sampling`, the slot, and the arrays that it writes. It returns at
-    once where `active` is 0; else it uses the number of the sample and increments it.
+    The kernel's parameters are the inputs, a `Sampling`, the slot, and the output arrays. It must return at
+    once if `active` is 0; else it uses the number of the sample and increments it.
     """
 
     def __init__(
@@ -278,21 +278,21 @@ class StateSampler(Sampler):
         late: LateConfig | None = None,
         before: Callable[[], None] | None = None,
     ) -> None:
-        """Allocate what it needs.
+        """Allocate the arrays.
 
         Args:
-            context: What it is made for.
+            context: Context of `StateSensorConfig.make`.
             kernel: See above.
             inputs: First parameters of the kernel.
-            packet: Returns the packet of a sample, from its rows by name and the header; the class of the
-                packet, if its fields are named as the `outputs`.
-            outputs: Warp types of what it measures, by name: an array of shape [slot, world] each; (type, n,
-                ...) is one of shape [slot, world, n, ...].
-            are_stacked: The kernel writes one array, shape [output, slot, world], in place of one for each.
-            terms: Names of what is computed; with any there is a memory for errors.
-            group_count: How many groups of errors there are, of three axes each.
-            late: Delay and dropouts; before the first sample the state was that of it.
-            before: Launches what a measurement needs.
+            packet: Function that returns the packet of a sample, from its rows by name and the header; or the
+                packet class, if its fields have the names of `outputs`.
+            outputs: Warp types of the measurements, by name: each has an array of shape [slot, world];
+                (type, n, ...) has one of shape [slot, world, n, ...].
+            are_stacked: The kernel writes one array, shape [output, slot, world], in place of one per output.
+            terms: Names of optional terms; with any, memory for errors is allocated.
+            group_count: Number of groups of errors, of three axes each.
+            late: Delay and dropouts; the state before the first sample equals that of the first sample.
+            before: Function that launches work before each measurement.
         """
         vehicle = context.vehicle
         self.terms, self._packet, self._before = terms, packet, before
@@ -374,19 +374,21 @@ def make_reader(
     is_scalar: bool = False,
     late: LateConfig | None = None,
 ) -> StateSampler:
-    """Return a sensor at work that reads something of each vehicle, to which errors are added.
+    """Return a sampler that calls a Warp function for each vehicle and adds errors.
 
     Args:
-        context: What it is made for.
-        read: A Warp function of the model, `Motion`, the world and the number of an output; it returns a
-            vec3d.
-        model: What it reads besides, of the Warp type of its first parameter.
-        errors: Names of its outputs, in the order of their numbers, and the errors of each.
-        packet: Returns the packet of a sample; see `StateSampler`.
+        context: Context of `StateSensorConfig.make`.
+        read: A Warp function of the model, `Motion`, the index of the world and the index of an output; it
+            returns a vec3d.
+        model: First argument of `read`, of its Warp type.
+        errors: Errors of each output, by name, in the order of their indices.
+        packet: Packet class, or function that returns the packet of a sample; see `StateSampler`.
         rate_hz: Samples a second [Hz].
-        is_scalar: An output is only the first number of what is read, float64, in place of vec3d.
+        is_scalar: Outputs are float64, the first number of the vec3d, in place of vec3d.
         late: Delay and dropouts; see `StateSampler`.
     """
+    if not isinstance(read, wp.Function):
+        raise TypeError(f"sensor {context.name!r}: it must read by a Warp function (@wp.func), got {read!r}")
     for each in errors.values() if is_scalar else ():
         for key in ("white", "walk", "markov", "resolution"):
             if isinstance(value := getattr(each, key), tuple):
@@ -409,11 +411,11 @@ def make_reader(
 
 
 def make_sampler(config: StateSensorConfig, context: SamplerContext) -> Sampler:
-    """Return a state sensor at work, and check what it has allocated.
+    """Make a state sensor and check its arrays.
 
     Raises:
         TypeError: It has no arrays.
-        ValueError: An array has another shape than it needs.
+        ValueError: An array has a wrong shape.
     """
     made, shape = config.make(context), (context.slot_count, context.vehicle.count)
     arrays = getattr(made, "arrays", None)
@@ -432,7 +434,7 @@ def make_sampler(config: StateSensorConfig, context: SamplerContext) -> Sampler:
 
 
 class _Rows(dict[str, NDArray[Any]]):
-    """The rows of a sample; one that is not there is said by the names of those that are."""
+    """The rows of a sample; the error of a missing row lists the known ones."""
 
     sensor = ""
 

@@ -18,6 +18,7 @@ import warp as wp
 
 from neurosim_core.clock import Rate, to_ns
 from neurosim_core.config import SimulationConfig
+from neurosim_core.garbage import pause_collection
 from neurosim_core.path_process import NotPlannedError, PlanningProcess
 from neurosim_core.render.renderer import upload_scene
 from neurosim_core.runtime.timing import timed
@@ -31,7 +32,7 @@ from neurosim_core.sim.schedule import Schedule
 from neurosim_core.trajectory import CollisionFreeConfig, Path, check_thrust, make_path
 from neurosim_core.trajectory.shapes import HoverConfig, hover
 from neurosim_core.vehicle import MultirotorConfig
-from neurosim_core.warp_start import start_warp
+from neurosim_core.warp_start import find_device
 
 _POSE_RATE_HZ = 500.0
 """Lowest rate at which poses are recorded for rays with times of their own [Hz]. For rotors with a time
@@ -127,10 +128,11 @@ def make_fleet(
 
     Arguments and errors as for `make_model`.
     """
-    if reader is not None:
-        with contextlib.suppress(NotReadError):
-            return _make_fleet(config, reader, on_phase, meanwhile)
-    return _make_fleet(config, None, on_phase, meanwhile)
+    with pause_collection():
+        if reader is not None:
+            with contextlib.suppress(NotReadError):
+                return _make_fleet(config, reader, on_phase, meanwhile)
+        return _make_fleet(config, None, on_phase, meanwhile)
 
 
 def _make_fleet(
@@ -162,7 +164,7 @@ def _make_fleet(
         def plan_in_other_process() -> tuple[FreeSpace, dict[str, Path]]:
             if reader is None or reader.planner is None:
                 raise NotPlannedError
-            return _plan_in_other_process(members, reader.planner, mapping.result(), reading.result())
+            return _plan_in_other_process(members, reader.planner, reading.result(), mapping.result)
 
         def upload(scene: Scene) -> Any:
             context.result()
@@ -249,7 +251,10 @@ def plan_paths(config: SimulationConfig, vehicles: Sequence[str] | None = None) 
 
 
 def _plan_in_other_process(
-    members: Mapping[str, SimulationConfig], planner: PlanningProcess, unseeded: FreeSpace, scene: Scene
+    members: Mapping[str, SimulationConfig],
+    planner: PlanningProcess,
+    scene: Scene,
+    mapped: Callable[[], FreeSpace],
 ) -> tuple[FreeSpace, dict[str, Path]]:
     """Plan as `_plan_in_this_process` does, in another process.
 
@@ -263,7 +268,7 @@ def _plan_in_other_process(
     for config in members.values():
         check_thrust(config.path, config.vehicle.airframe())
     settings = next(iter(members.values())).free_space
-    free_space, paths = planner.plan(unseeded, settings, flights, inside_m=scene.inside_m)
+    free_space, paths = planner.plan(scene, settings, flights, mapped=mapped)
     return free_space, dict(zip(members, paths, strict=True))
 
 
@@ -342,24 +347,3 @@ def _pose_clocks(config: SimulationConfig, groups: Sequence[RenderGroup]) -> tup
         return ()
     control_hz = config.control.rate_hz
     return (Rate(control_hz * math.ceil(_POSE_RATE_HZ / control_hz)),)
-
-
-def find_device(name: str) -> str:
-    """Return the Warp name of a device setting: auto, cuda, cpu, cuda:0, ...
-
-    Raises:
-        ValueError: The device is not on this machine.
-        RuntimeError: This process was forked from one that had used a device.
-    """
-    start_warp()
-    known = [str(device) for device in wp.get_devices()]
-    if name == "auto":
-        return "cuda:0" if "cuda:0" in known else "cpu"
-    if name == "cuda":
-        name = "cuda:0"
-    if name not in known:
-        raise ValueError(
-            f"device {name!r} is not on this machine, known: {known}; cuda needs an NVIDIA GPU and its "
-            "driver (`nvidia-smi` lists it), and device: auto takes a GPU if there is one, else the CPU"
-        )
-    return name

@@ -18,7 +18,8 @@ from neurosim_core.render.config import CandidateListConfig
 from neurosim_core.render.kernel_data import RenderTerms, SceneData
 from neurosim_core.render.scene_arrays import SceneArrays
 from neurosim_core.scene.freespace import DistanceField
-from neurosim_core.sim.model import Model, find_device, make_model, refit
+from neurosim_core.sim.model import Model, make_model, refit
+from neurosim_core.warp_start import find_device
 
 _logger = logging.getLogger(__name__)
 

@@ -27,7 +27,6 @@ from neurosim_core.sensors.base import (
 )
 from neurosim_core.sensors.state_sampler import make_sampler
 from neurosim_core.sim.inputs import CommandBuffer, Start, begin_of_paths, restart
-from neurosim_core.sim.kinematic_vehicle import KinematicVehicle
 from neurosim_core.sim.model import Model
 from neurosim_core.sim.parameters import WorldSettings
 from neurosim_core.sim.render_group import PictureAllocator, RenderGroupState, make_render_groups
@@ -323,6 +322,8 @@ def _make_vehicle(model: Model, worlds: WorldSettings, seeds: Any) -> Vehicle:
     """Return the vehicles of all worlds."""
     max_step_ns = to_ns(model.config.vehicle.max_step_s)
     if model.path.attitude is not None:
+        from neurosim_core.sim.kinematic_vehicle import KinematicVehicle
+
         return KinematicVehicle(
             model.airframe,
             [each.path for each in worlds.scenes.models],

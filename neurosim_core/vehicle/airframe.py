@@ -204,10 +204,20 @@ def preset(name: str, **overrides: Any) -> MultirotorConfig:
     Raises:
         ValueError: The name or a parameter is unknown, or a value is out of range.
     """
+    return MultirotorConfig(**preset_values(name) | overrides)
+
+
+def preset_values(name: str) -> dict[str, Any]:
+    """Return the parameters of an airframe as they are in `presets.yaml`.
+
+    Raises:
+        ValueError: The name is unknown.
+    """
     airframes = read_table(__file__, "presets")
     if name not in airframes:
         raise ValueError(f"unknown airframe {name!r}, known: {sorted(airframes)}")
-    return MultirotorConfig(**{**airframes[name], **overrides})
+    values: dict[str, Any] = airframes[name]
+    return values
 
 
 def make_airframe(config: MultirotorConfig, device: Any) -> tuple[Airframe, Rotors]:

@@ -15,7 +15,14 @@ from neurosim_core.config_errors import explain
 from neurosim_core.frames import as_rows, normalised
 from neurosim_core.registry import register
 from neurosim_core.runtime.cuda import RecordedLaunch
-from neurosim_core.vehicle.airframe import TERMS, MultirotorConfig, alike, make_airframe, preset
+from neurosim_core.vehicle.airframe import (
+    TERMS,
+    MultirotorConfig,
+    alike,
+    make_airframe,
+    preset,
+    preset_values,
+)
 from neurosim_core.vehicle.arrays import (
     BLOCK_DIM,
     Acceleration,
@@ -356,7 +363,7 @@ class MultirotorVehicleConfig(VehicleConfig):
     @model_validator(mode="after")
     def _airframe_exists(self) -> MultirotorVehicleConfig:
         try:
-            self.airframe()
+            MultirotorConfig.model_validate(preset_values(self.preset) | self.parameters)
         except ValidationError as error:
             lines = explain(MultirotorConfig, error)
             whole = any(not item["loc"] for item in error.errors())

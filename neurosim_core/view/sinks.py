@@ -70,13 +70,14 @@ class OverviewSink:
         """Start empty."""
         self._file, self._model = file, context.model
         self._summary = FlightSummary(context.header.sensors)
-        self._begun_s = time.perf_counter()
+        self._begin_s = self._end_s = context.begin_s
         self._stamp_ns = 0
         self._has_pose = self._closed = False
 
     def write(self, packet: Packet) -> None:
         """Take a packet."""
         self._summary.log(packet)
+        self._end_s = time.perf_counter()
         self._stamp_ns = max(self._stamp_ns, packet.stamp_ns)
         self._has_pose |= isinstance(packet, Odometry)
 
@@ -87,13 +88,13 @@ class OverviewSink:
         self._closed = True
         if not complete:
             return
-        factor = self._stamp_ns / NS_PER_S / (time.perf_counter() - self._begun_s)
+        flight_s = self._end_s - self._begin_s
         save_overview(
             self._file,
             self._summary,
             scene=self._model.scene,
             track=None if self._has_pose else self._planned_track(),
-            real_time_factor=factor,
+            real_time_factor=self._stamp_ns / NS_PER_S / flight_s if flight_s > 0.0 else None,
         )
 
     def _planned_track(self) -> Track:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from controller_commands import command_of
-from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.control import MODES, Controller, Se3Config
+from neurosim_core.settings_file import ConfigError
 from neurosim_core.trajectory.shapes import FigureEightConfig, figure_eight
 from neurosim_core.vehicle import DynamicsError, Multirotor, preset
 
@@ -200,7 +200,7 @@ def test_other_errors_are_clear():
         Controller("position", HUMMINGBIRD, paths=a_path())
     with pytest.raises(ValueError, match="unit quaternions"):
         Controller("attitude", HUMMINGBIRD).set([5.0, 0.0, 0.0, 0.0, 0.0])
-    with pytest.raises(ValidationError, match="velocity_gain_per_s"):
+    with pytest.raises(ConfigError, match="velocity_gain_per_s"):
         Se3Config(velocity_gain_per_s=0.0)
 
 

@@ -71,6 +71,8 @@ def test_the_page(tmp_path, capsys, monkeypatch):
     text = capsys.readouterr().out
     assert "a.raw" in text
     assert "32x24" in text
+    for heading in text.splitlines()[0].split()[-3:]:
+        assert f"{heading}: " in text  # says what it is
     assert cli.main(["compare", str(tmp_path), "--out", str(tmp_path / "folder.png")]) == 0
     assert capsys.readouterr().out.splitlines()[:-1] == text.splitlines()[:-1]  # a folder is its files
     monkeypatch.setenv("COLUMNS", "500")  # or long paths would be folded

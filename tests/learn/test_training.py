@@ -312,9 +312,11 @@ def test_a_run_says_how_far_a_block_has_come(tmp_path, hall, monkeypatch):
     pytest.importorskip("tensorboard")
     monkeypatch.setattr("neurosim_core.learn.train._TELL_S", 0.0)
     said: list[str] = []
-    Training(tmp_path, small(block=4), say=said.append, models=[hall]).run(until=(4, 0))
-    assert [line.split()[1] for line in said] == ["1/4:", "2/4:", "3/4:", "4/4"]
-    assert all(line.startswith("teacher ") and "reward" in line for line in said)
+    Training(tmp_path, small(block=4), say=said.append, models=[hall]).run()
+    assert [line.split()[1] for line in said] == ["1/4:", "2/4:", "3/4:", "4/4"] * 2
+    assert all(line.startswith("teacher ") and "reward" in line for line in said[:4])
+    errors = ("imitation error ", "velocity error ")  # of actions, and of what students estimate besides
+    assert all(line.startswith("student ") and all(e in line for e in errors) for line in said[4:])
 
 
 def test_a_run_sees_events_as_it_is_told(tmp_path, hall):

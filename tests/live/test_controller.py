@@ -360,6 +360,7 @@ def test_fly_serves_one_simulator_after_the_other(start_fly, paths):
                 simulator.say("ended", "it has hit the floor")  # the announcement is looked at before this
                 process.wait_until_said("it has hit the floor")
                 assert process.said.count("flying drone") == count
+                assert "another scene" not in process.said
                 assert process.process.poll() is None
         if run_on:
             process.wait_until_said("waiting for a simulator", 2)
@@ -367,18 +368,22 @@ def test_fly_serves_one_simulator_after_the_other(start_fly, paths):
 
 
 def test_fly_takes_the_vehicles_that_it_is_told(start_fly, tmp_path):
-    """With settings of its own, in the mode that it is told, and SIGTERM ends it at once."""
+    """With settings of its own, in the mode that it is told, and SIGTERM ends it at once.
+
+    That the simulator has another scene is said.
+    """
     settings = tmp_path / "scene.yaml"
     config = {**CONFIG, "vehicles": {"red": {}, "blue": {}}}
     settings.write_text(to_yaml(load_config(config)))
     process = start_fly(str(settings), "--vehicle", "blue", "--mode", "position")
     with Node("simulator") as node:
         stage = Stage(node, "blue", "position")
-        simulator = Simulator(node, config)
+        simulator = Simulator(node, {**config, "scene": {**CONFIG["scene"], "rooms": 1}})
         stage.send(0)
         start = plan_paths(load_config(config))["blue"].evaluate([0])
         assert stage.hear(60.0) == (0, np.array([*start.position[0], start.yaw[0]]).tobytes())
         assert simulator.stages["red"].odometry.subscriber_count == 0
+        process.wait_until_said("another scene, where the path may meet walls: scene.rooms is 1, here 2\n")
         process.process.send_signal(signal.SIGTERM)
         assert process.process.wait(SOON_S) == 130
     assert "interrupted" in process.said

@@ -16,12 +16,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
-from pydantic import ValidationError
 
 from neurosim_core.scene import gltf
 from neurosim_core.scene.mesh import MeshSceneConfig, SceneError, load_mesh_scene
 from neurosim_core.scene.scene import Scene
 from neurosim_core.scene.topology import smooth_normals
+from neurosim_core.settings_file import ConfigError
 
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=np.float32)
 RED, GREEN, BLUE, WHITE = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
@@ -979,7 +979,7 @@ def test_no_file_directory_and_format(tmp_path):
 
 @pytest.mark.parametrize("bad", [{"unit_m": 0.0}, {"unit_m": -1.0}, {"up_axis": "w"}, {"scale": 2.0}])
 def test_config_is_checked(bad):
-    with pytest.raises(ValidationError, match=next(iter(bad))):
+    with pytest.raises(ConfigError, match=next(iter(bad))):
         MeshSceneConfig(file=Path("a.glb"), **bad)
 
 

@@ -115,7 +115,7 @@ def test_what_is_refused(device):
     batch.reset(np.stack([frames[0]] * 2))
     with pytest.raises(ValueError, match="float32 of shape"):
         batch.step(frames[0], 1_000_000)
-    with pytest.raises(ValueError, match="stamp_ns must be later than 0, that of the frame before"):
+    with pytest.raises(ValueError, match="stamp_ns must be later than 0, that of the previous frame"):
         batch.step(np.stack([frames[0]] * 2), 0)
     events = batch.step(np.stack([frames[1]] * 2), 1_000_000)
     batch.step(np.stack([frames[1]] * 2), 2_000_000)

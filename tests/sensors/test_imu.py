@@ -7,13 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import warp as wp
-from pydantic import ValidationError
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from neurosim_core.sensors.base import SamplerContext
 from neurosim_core.sensors.imu import CORRELATION_TIMES_S, ImuConfig
 from neurosim_core.sensors.state_sampler import StateSampler
+from neurosim_core.settings_file import ConfigError
 from neurosim_core.vehicle import Multirotor, preset
 
 MS = 1_000_000
@@ -324,5 +324,5 @@ def test_errors_that_are_0_are_left_out(device):
     ],
 )
 def test_parameters_are_checked(wrong):
-    with pytest.raises(ValidationError, match=next(iter(wrong))):
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
         ImuConfig(**wrong)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 from small_room import fly_in_room, write_room
 
 from neurosim_core.sensors.range_finder import Range, RangeFinderConfig
+from neurosim_core.settings_file import ConfigError
 
 
 def reading(tmp_path, **settings) -> Range:
@@ -49,5 +49,5 @@ def test_beyond_its_range_it_says_so(tmp_path):
 
 
 def test_a_range_without_length_is_refused():
-    with pytest.raises(ValidationError, match="range_min_m must be below range_max_m = 1, got 2"):
+    with pytest.raises(ConfigError, match="range_min_m must be below range_max_m = 1, got 2"):
         RangeFinderConfig(range_min_m=2.0, range_max_m=1.0)

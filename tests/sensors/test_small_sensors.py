@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 import warp as wp
-from pydantic import ValidationError
 from scipy import stats
 from scipy.spatial.transform import Rotation
 from small_room import room_scene
@@ -21,6 +20,7 @@ from neurosim_core.sensors.gps import GpsConfig, geodetic
 from neurosim_core.sensors.imu import ImuConfig
 from neurosim_core.sensors.magnetometer import MagnetometerConfig
 from neurosim_core.sensors.state_estimate import StateEstimateConfig
+from neurosim_core.settings_file import ConfigError
 from neurosim_core.vehicle import Multirotor, preset
 
 FALSE_ALARM = 1e-6
@@ -184,7 +184,7 @@ def test_a_fix_is_of_the_state_before_and_of_the_antenna():
         a, b = late.arrays[name].numpy()[:, 0], now.arrays[name].numpy()[:, 0]
         np.testing.assert_array_equal(a, b[[0, 0, 0, 1, 2, 3]])
     np.testing.assert_allclose(now.arrays["velocity"].numpy()[0, 0], [0.0, 1.0, 0.0], atol=1e-12)
-    with pytest.raises(ValidationError, match="delay_s must be a multiple of 1 / rate_hz"):
+    with pytest.raises(ConfigError, match="delay_s must be a multiple of 1 / rate_hz"):
         GpsConfig(rate_hz=10, delay_s=0.15)
 
 

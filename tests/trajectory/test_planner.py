@@ -7,11 +7,11 @@ import ast
 import numpy as np
 import pytest
 import trimesh
-from pydantic import ValidationError
 
 from neurosim_core.scene.apartment import ApartmentConfig, make_apartment
 from neurosim_core.scene.freespace import FreeSpace, FreeSpaceConfig, make_free_space
 from neurosim_core.scene.scene import Scene
+from neurosim_core.settings_file import ConfigError
 from neurosim_core.trajectory import Path, TourConfig, check_thrust, make_path
 from neurosim_core.trajectory.certify import prove_clearance, segment_clearance
 from neurosim_core.trajectory.feasibility import FlightLimits, flight_bounds
@@ -233,7 +233,7 @@ def test_a_path_may_ask_for_no_more_thrust_than_the_vehicle_has():
 
 
 def test_configuration_refuses_nonsense():
-    with pytest.raises(ValidationError, match="at least 2"):
+    with pytest.raises(ConfigError, match="at least 2"):
         WaypointsConfig(points_m=((0.0, 0.0, 0.0),))
-    with pytest.raises(ValidationError, match="clearance_m"):
+    with pytest.raises(ConfigError, match="clearance_m"):
         TourConfig(clearance_m=0.0)

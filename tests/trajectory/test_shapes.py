@@ -7,9 +7,9 @@ import math
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 from scipy import integrate
 
+from neurosim_core.settings_file import ConfigError
 from neurosim_core.trajectory.shapes import (
     CircleConfig,
     FigureEightConfig,
@@ -151,9 +151,9 @@ def test_travel_looks_along_the_circle():
 
 
 def test_configuration_refuses_nonsense():
-    with pytest.raises(ValidationError, match="end_m must differ"):
+    with pytest.raises(ConfigError, match="end_m must differ"):
         LineConfig(start_m=(0.0, 0.0, 0.0), end_m=(0.0, 0.0, 0.0))
-    with pytest.raises(ValidationError, match="amplitude_m"):
+    with pytest.raises(ConfigError, match="amplitude_m"):
         LissajousConfig(amplitude_m=(0.0, 0.0, 0.0))
-    with pytest.raises(ValidationError, match="greater than 0"):
+    with pytest.raises(ConfigError, match="greater than 0"):
         CircleConfig(radius_m=0.0)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from multirotor_oracle import NO_AERO, angle, rotation_matrix, solve
-from pydantic import ValidationError
 from scipy.optimize import brentq
 
 from neurosim_core import load_config, sim
 from neurosim_core.packets import Collision, Odometry
+from neurosim_core.settings_file import ConfigError
 from neurosim_core.vehicle import TERMS, GroundConfig, Multirotor, MultirotorConfig, MultirotorState, preset
 
 MS = 1_000_000
@@ -302,5 +302,5 @@ def test_terms_of_the_ground():
     ],
 )
 def test_ground_is_checked(values, message):
-    with pytest.raises(ValidationError, match=message):
+    with pytest.raises(ConfigError, match=message):
         GroundConfig(**values)

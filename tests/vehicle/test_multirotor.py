@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import warp as wp
 from multirotor_oracle import NO_AERO, derivative, rotation_matrix
-from pydantic import ValidationError
 
+from neurosim_core.settings_file import ConfigError
 from neurosim_core.vehicle import TERMS, DynamicsError, Multirotor, MultirotorConfig, MultirotorState, preset
 
 MS = 1_000_000
@@ -415,7 +415,7 @@ def test_reset_refuses(state, message, device):
     ],
 )
 def test_parameters_are_checked(override, message):
-    with pytest.raises(ValidationError, match=message):
+    with pytest.raises(ConfigError, match=message):
         preset("hummingbird", **override)
 
 

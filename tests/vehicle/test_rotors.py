@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from multirotor_oracle import angle, derivative, solve
-from pydantic import ValidationError
 
 from neurosim_core.control import Controller
+from neurosim_core.settings_file import ConfigError
 from neurosim_core.vehicle import TERMS, Multirotor, MultirotorState, preset
 
 MS = 1_000_000
@@ -90,5 +90,5 @@ def test_a_controller_knows_its_rotors(device):
     ],
 )
 def test_scales_are_checked(name, value, message):
-    with pytest.raises(ValidationError, match=message):
+    with pytest.raises(ConfigError, match=message):
         preset("hummingbird", **{name: value})

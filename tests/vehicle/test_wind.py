@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import warp as wp
 from multirotor_oracle import NO_AERO, angle, solve
-from pydantic import ValidationError
 from scipy import stats
 from scipy.linalg import expm, solve_continuous_lyapunov
 
 from neurosim_core import load_config, sim
+from neurosim_core.settings_file import ConfigError
 from neurosim_core.vehicle import (
     TERMS,
     GroundConfig,
@@ -457,7 +457,7 @@ def test_moving_air_that_nothing_feels_is_refused(name):
     """The racer has no drag of any kind."""
     gust = GustConfig(velocity_m_s=(1.0, 0.0, 0.0), start_s=0.0, rise_s=1.0)
     weather = {"wind_m_s": (1.0, 0.0, 0.0), "gusts": (gust,), "turbulence": MODERATE}[name]
-    with pytest.raises(ValidationError, match=f"{name}: moving air does nothing to a vehicle without drag"):
+    with pytest.raises(ConfigError, match=f"{name}: moving air does nothing to a vehicle without drag"):
         preset("racer", **{name: weather})
     felt = preset("racer", flapping_kg_m=1e-6, **{name: weather})
     assert name.removesuffix("_m_s") in felt.terms()
@@ -488,5 +488,5 @@ def test_weather_is_checked(kind, values, message):
         TurbulenceConfig: {"wind_20ft_m_s": 5.0},
     }[kind]
     kind(**right)
-    with pytest.raises(ValidationError, match=message):
+    with pytest.raises(ConfigError, match=message):
         kind(**{**right, **values})
