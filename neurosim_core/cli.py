@@ -98,7 +98,9 @@ class _Parser(argparse.ArgumentParser):
             from neurosim_core.config_errors import suggestion
 
             message += f"; {suggestion(wrong[1], re.findall(r'[^ ,]+', wrong[2].replace(chr(39), '')))}"
-        self.exit(2, f"{self.prog}: {message.rstrip('; ')}; `{self.prog} --help` lists what there is\n")
+        message = message.rstrip("; ")
+        stop = "" if message.endswith("?") else ";"
+        self.exit(2, f"{self.prog}: {message}{stop} `{self.prog} --help` lists what there is\n")
 
 
 def _parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
@@ -386,7 +388,8 @@ def _scene(arguments: argparse.Namespace) -> int:
 def _view(arguments: argparse.Namespace) -> int:
     kinds = (".rrd",) if arguments.flight is None else (".rrd", ".webp", ".gif")
     if arguments.save is not None and arguments.save.suffix not in kinds:
-        raise ValueError(f"--save writes {' or '.join(kinds)} here, got {arguments.save}")
+        what = "a live run as .rrd" if arguments.flight is None else "a flight as .rrd, .webp or .gif"
+        raise ValueError(f"--save writes {what}, got {arguments.save}")
     if arguments.flight is None:
         from neurosim_core.live.viewer import view
 

@@ -80,7 +80,9 @@ def _make(arguments: argparse.Namespace) -> int:
             progress.advance(task)
     missing = len(plan.missing())
     if missing:
-        console.print(f"interrupted; {missing} flights are missing: the same command goes on", style="yellow")
+        console.print(
+            f"interrupted; {_flight_count(missing)} missing: the same command goes on", style="yellow"
+        )
         return 130
     # Who flies changes no byte, and so is no part of the command.
     who = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -94,8 +96,12 @@ def _make(arguments: argparse.Namespace) -> int:
         windows = Dataset(plan.folder)
         count = len(write_shards((windows[k] for k in range(len(windows))), shards))
         console.print(f"{shards}/: {len(windows):,} windows in {count} shards")
-    console.print(f"{plan.folder}/: README.md, sheet.png, SHA256SUMS, {plan.flight_count} flights")
+    console.print(f"{plan.folder}/: README.md, sheet.png, SHA256SUMS, {_flight_count(plan.flight_count)}")
     return 0
+
+
+def _flight_count(count: int) -> str:
+    return f"{count} flight{'s' * (count != 1)}"
 
 
 def _flights(plan: DatasetPlan, arguments: argparse.Namespace, stopped: Callable[[], bool]) -> Iterator[int]:
@@ -161,9 +167,9 @@ def _compare(arguments: argparse.Namespace) -> int:
                 f"{one.event_count:,}",
                 f"{one.duration_s:.3f}",
                 f"{one.mean_rate_hz / 1e6:.3f}",
-                f"{one.on_share:.1%}",
+                f"{100 * one.on_share:.1f} %",
                 f"{one.median_interval_us / 1000.0:.3g} ms",
-                f"{one.silent_share:.1%}",
+                f"{100 * one.silent_share:.1f} %",
                 f"{one.centroid:.3f}",
             )
         status.update("drawing")
