@@ -98,7 +98,9 @@ class _Parser(argparse.ArgumentParser):
             from neurosim_core.config_errors import suggestion
 
             message += f"; {suggestion(wrong[1], re.findall(r'[^ ,]+', wrong[2].replace(chr(39), '')))}"
-        self.exit(2, f"{self.prog}: {message.rstrip('; ')}; `{self.prog} --help` lists what there is\n")
+        message = message.rstrip("; ")
+        stop = "" if message.endswith("?") else ";"
+        self.exit(2, f"{self.prog}: {message}{stop} `{self.prog} --help` lists what there is\n")
 
 
 def _parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
@@ -151,7 +153,7 @@ def _add_serve(commands: _Commands) -> None:
 
 def _add_fly(commands: _Commands) -> None:
     fly = commands.add_parser("fly", help="run the controller that follows the path, in its own process")
-    add_settings(fly)
+    add_settings(fly, default="those of the simulator")
     fly.add_argument("--vehicle", metavar="NAME", help="vehicle to fly (default: all)")
     fly.add_argument(
         "--mode",
@@ -256,14 +258,18 @@ def _add_view(commands: _Commands) -> None:
         "--only", metavar="NAMES", help="live: show only these sensors, such as events,imu; others stay off"
     )
     view.add_argument(
-        "--event-window", type=float, default=0.02, metavar="S", help="event window of a picture [s]"
+        "--event-window",
+        type=float,
+        default=0.02,
+        metavar="S",
+        help="event window of a picture [s] (default: 0.02)",
     )
     view.add_argument(
         "--image-rate",
         type=float,
         default=15.0,
         metavar="HZ",
-        help="live: largest image rate of a sensor [Hz]; events have a separate limit",
+        help="live: largest image rate of a sensor [Hz] (default: 15); events have a separate limit",
     )
     view.add_argument("--port", type=int, default=0, help="--web: port of the page (default: any)")
     view.add_argument("--no-browser", action="store_true", help="--web: print the address only")
@@ -386,7 +392,8 @@ def _scene(arguments: argparse.Namespace) -> int:
 def _view(arguments: argparse.Namespace) -> int:
     kinds = (".rrd",) if arguments.flight is None else (".rrd", ".webp", ".gif")
     if arguments.save is not None and arguments.save.suffix not in kinds:
-        raise ValueError(f"--save writes {' or '.join(kinds)} here, got {arguments.save}")
+        what = "a live run as .rrd" if arguments.flight is None else "a flight as .rrd, .webp or .gif"
+        raise ValueError(f"--save writes {what}, got {arguments.save}")
     if arguments.flight is None:
         from neurosim_core.live.viewer import view
 

@@ -72,6 +72,8 @@ def register(category: str, kind: str) -> Callable[[Registered], Registered]:
                 f"give {cls.__module__}.{cls.__qualname__} another"
             )
         own = getattr(cls, "model_fields", {}).get("kind")
+        if category not in ("noise", "task") and not isinstance(getattr(own, "default", None), str):
+            raise TypeError(f'{cls.__qualname__} needs a field `kind: Literal["{kind}"] = "{kind}"`')
         if own is not None and own.default != kind:
             raise ValueError(
                 f"{cls.__qualname__} is registered as {category} kind {kind!r}, but its field `kind` is "

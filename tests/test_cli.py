@@ -334,8 +334,8 @@ def test_a_signal_ends_a_command_that_cannot_say_so():
             "--seed, --set: for a video, and this",
         ),
         ("convert in.mp4 out.h5 --from-zero --to evt3", "--to, --from-zero: for a file of events, and this"),
-        ("view flight --save film.mp4", "--save writes .rrd or .webp or .gif here, got film.mp4"),
-        ("view --save film.webp", "--save writes .rrd here, got film.webp"),
+        ("view flight --save film.mp4", "--save writes a flight as .rrd, .webp or .gif, got film.mp4"),
+        ("view --save film.webp", "--save writes a live run as .rrd, got film.webp"),
         ("serve --lockstep --factor 2", "--factor is for streaming"),
     ],
 )

@@ -425,7 +425,10 @@ def test_any_value_is_taken_or_refused_by_name(key, value):
     ("settings", "message"),
     [
         ({"links": {"nix": {}}}, "links.nix: vehicle 'drone' has no such link, known: events, rgb"),
-        ({"links": {"command": {"clock_offset_s": 1.0}}}, "a command has no clock of its own"),
+        (
+            {"links": {"command": {"clock_offset_s": 1.0}}},
+            "clock_offset_s and clock_drift_ppm are for links of sensors",
+        ),
         ({"links": {"imu": {"loss": 1.5}}}, "links.imu.loss: .* less than or equal to 1, got 1.5"),
         ({"vehicles": {}}, "vehicles: .* at least 1 item"),
         ({"vehicles": {"b": {"sensors": {"path": {"kind": "imu"}}}}}, "'path' is taken by the planned path"),

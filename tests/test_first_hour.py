@@ -19,7 +19,7 @@ FILES = {
 
 MISTAKES = {
     "rnu": "did you mean 'run'?",
-    "run --overwirte": "did you mean '--overwrite'?",
+    "run --overwirte": "did you mean '--overwrite'? `neurosim run --help` lists what there is",
     "run --duration four": "--duration: invalid float value: 'four'",
     "run scene.yaml": "`neurosim run --print-config > scene.yaml` makes one",
     "run house.glb": "house.glb: no such file; settings are YAML, in which a mesh is scene: {kind: mesh",

@@ -130,7 +130,10 @@ def _transfer(arguments: argparse.Namespace) -> int:
     check_new(out, overwrite=arguments.overwrite)
     console = Console()
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with raise_at_signals() as raise_again, Progress(*columns, console=console, transient=True) as progress:
+    with (
+        raise_at_signals() as raise_again,
+        Progress(*columns, console=console, transient=True, disable=not console.is_interactive) as progress,
+    ):
         task = progress.add_task("converting", total=None)
 
         def on_block(count: int) -> None:
@@ -182,7 +185,10 @@ def _convert_video(arguments: argparse.Namespace) -> int:
         TextColumn("{task.fields[count]}"),
         TimeRemainingColumn(),
     ]
-    with stop_at_signals(stop), Progress(*columns, console=console, transient=True) as progress:
+    with (
+        stop_at_signals(stop),
+        Progress(*columns, console=console, transient=True, disable=not console.is_interactive) as progress,
+    ):
         task = progress.add_task("converting", total=None, count="")
 
         def on_start(source: Description) -> None:
@@ -271,11 +277,16 @@ def _facts(c: Conversion) -> list[tuple[str, str]]:
         ("sensor", f"{plan.width}x{plan.height}, {describe_pixel(c.pixel)}, dark floor {plan.dark_floor:g}"),
         (
             "events",
-            f"{c.event_count:,} ({event_rate:.2f} M/s, {on_share:.0%} brighter), {c.dropped_count:,} dropped",
+            f"{c.event_count:,} ({event_rate:.2f} M/s, {_percent(on_share)} brighter), "
+            f"{c.dropped_count:,} dropped",
         ),
         ("time", f"{c.wall_s:.1f} s: real-time factor {c.real_time_factor:.2f}"),
         ("sampling", _sampling(c)),
     ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
 
 
 def _sampling(c: Conversion) -> str:
@@ -284,8 +295,8 @@ def _sampling(c: Conversion) -> str:
     slow = c.halved_loss > _HALVED_LOSS_MAX or c.burst_share > _BURST_SHARE_MAX
     return (
         f"{'too slow' if slow else 'fast enough'} for this motion: without every second frame "
-        f"{max(c.halved_loss, 0.0):.0%} of the events would be missing; {c.burst_share:.0%} of the pixels "
-        "that fire between two frames do so four times or more"
+        f"{_percent(max(c.halved_loss, 0.0))} of the events would be missing; {_percent(c.burst_share)} of "
+        "the pixels that fire between two frames do so four times or more"
     )
 
 
@@ -299,14 +310,15 @@ def _warnings(c: Conversion) -> list[str]:
         )
     if c.halved_loss > _HALVED_LOSS_MAX:
         notes.append(
-            f"the motion is fast for this frame rate: without every second frame {c.halved_loss:.0%} of the "
-            "events would be missing, so as many or more are missing now. Film faster, or take a part where "
-            "less moves."
+            "the motion is fast for this frame rate: without every second frame "
+            f"{_percent(c.halved_loss)} of the events would be missing, so as many or more are missing now. "
+            "Film faster, or take a part where less moves."
         )
     if c.burst_share > _BURST_SHARE_MAX:
         notes.append(
-            f"{c.burst_share:.0%} of the pixels that fire do so four times or more within one interval: edges"
-            " pass them in less than that, and times within an interval are those of a cross-fade."
+            f"{_percent(c.burst_share)} of the pixels that fire do so four times or more within one "
+            "interval: edges pass them in less than that, and times within an interval are those of a "
+            "cross-fade."
         )
     if plan.code_step > plan.threshold:
         notes.append(

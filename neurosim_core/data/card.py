@@ -65,6 +65,7 @@ def _write_text(plan: DatasetPlan, stats: list[FlightStats], *, command: str, ha
         for name, sensor in config.sensors.items()
     )
     table = "\n".join(f"| {name} | {value} |" for name, value in rows)
+    scene = "k" if plan.flights_per_scene == 1 else f"k // {plan.flights_per_scene}"
     sheet = "\n![Event windows, pictures and depth of some flights](sheet.png)\n" if has_sheet else ""
     return f"""# {plan.folder.resolve().name}
 
@@ -89,8 +90,8 @@ Flights of {config.vehicle.title!r} simulated by Neurosim {__version__}. Made by
 
 `flights/NNNNN.h5` are recordings: HDF5 with events as in DSEC (`/events/x`, `y`, `t`, `p`, `/ms_to_idx`),
 and one group for each sensor. `NNNNN.json` has the statistics of a flight. `dataset.yaml` has all settings.
-Flight k has the seeds `seed + k` and `path.seed + k`; {plan.flights_per_scene} flights share a generated
-scene, and the next ones have the next seed. `sha256sum --check SHA256SUMS` checks the files.
+Flight k has the seeds `seed + k` and `path.seed + k`, and a generated scene `scene.seed + {scene}`.
+`sha256sum --check SHA256SUMS` checks the files.
 
 ## Licence
 
@@ -156,5 +157,5 @@ def _tile(picture: NDArray[np.uint8], label: str) -> Picture.Image:
     height = max(1, round(_TILE_PX * image.height / image.width))
     image = image.resize((_TILE_PX, height), Picture.Resampling.BOX if image.width >= _TILE_PX else 0)
     if label:
-        ImageDraw.Draw(image).text((6, 4), label, fill=(60, 60, 60))
+        ImageDraw.Draw(image).text((6, 4), label, fill=(60, 60, 60), stroke_width=2, stroke_fill="white")
     return image

@@ -29,7 +29,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     add_settings(parser)
     parser.add_argument("--flights", type=int, required=True, metavar="N", help="number of flights")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the data set")
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; 0: this process")
+    parser.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="processes (default: 1); 0: this process"
+    )
     parser.add_argument(
         "--ray",
         nargs="?",
@@ -80,7 +82,9 @@ def _make(arguments: argparse.Namespace) -> int:
             progress.advance(task)
     missing = len(plan.missing())
     if missing:
-        console.print(f"interrupted; {missing} flights are missing: the same command goes on", style="yellow")
+        console.print(
+            f"interrupted; {_flight_count(missing)} missing: the same command goes on", style="yellow"
+        )
         return 130
     # Who flies changes no byte, and so is no part of the command.
     who = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -94,8 +98,12 @@ def _make(arguments: argparse.Namespace) -> int:
         windows = Dataset(plan.folder)
         count = len(write_shards((windows[k] for k in range(len(windows))), shards))
         console.print(f"{shards}/: {len(windows):,} windows in {count} shards")
-    console.print(f"{plan.folder}/: README.md, sheet.png, SHA256SUMS, {plan.flight_count} flights")
+    console.print(f"{plan.folder}/: README.md, sheet.png, SHA256SUMS, {_flight_count(plan.flight_count)}")
     return 0
+
+
+def _flight_count(count: int) -> str:
+    return f"{count} flight{'s' * (count != 1)}"
 
 
 def _flights(plan: DatasetPlan, arguments: argparse.Namespace, stopped: Callable[[], bool]) -> Iterator[int]:
@@ -118,7 +126,9 @@ def add_compare_parser(commands: argparse._SubParsersAction[argparse.ArgumentPar
         "and on one page of plots.",
     )
     parser.add_argument("files", nargs="+", type=Path, help="files of events, or folders of them")
-    parser.add_argument("--out", type=Path, default=Path("compare.png"), help="PNG, PDF or SVG to write")
+    parser.add_argument(
+        "--out", type=Path, default=Path("compare.png"), help="PNG, PDF or SVG to write (./compare.png)"
+    )
     parser.add_argument("--size", metavar="WxH", help="resolution, for files that do not give it")
     parser.add_argument("--sensor", default="", metavar="NAME", help="event camera (default: the first)")
     parser.set_defaults(command=_compare)
@@ -161,9 +171,9 @@ def _compare(arguments: argparse.Namespace) -> int:
                 f"{one.event_count:,}",
                 f"{one.duration_s:.3f}",
                 f"{one.mean_rate_hz / 1e6:.3f}",
-                f"{one.on_share:.1%}",
+                f"{100 * one.on_share:.1f} %",
                 f"{one.median_interval_us / 1000.0:.3g} ms",
-                f"{one.silent_share:.1%}",
+                f"{100 * one.silent_share:.1f} %",
                 f"{one.centroid:.3f}",
             )
         status.update("drawing")

@@ -204,7 +204,7 @@ def draw_comparison(stats: Sequence[EventStats], out: Path) -> None:
     plots = [figure.add_subplot(grid[0, :]), figure.add_subplot(grid[1, :3]), figure.add_subplot(grid[1, 3:])]
     middles_us = np.sqrt(INTERVAL_EDGES_US[1:] * INTERVAL_EDGES_US[:-1])
     for one, color in zip(stats, _COLORS * len(stats), strict=False):
-        label = f"{one.name}: {one.mean_rate_hz / 1e6:.3g} M/s, {one.on_share:.0%} brighter"
+        label = f"{one.name}: {one.mean_rate_hz / 1e6:.3g} M/s, {100 * one.on_share:.0f} % brighter"
         times_s = (np.arange(len(one.rate_hz)) + 0.5) * RATE_BIN_US * 1e-6
         pixels = one.width * one.height
         plots[0].plot(times_s, np.maximum(one.rate_hz / pixels, 1e-9), color=color, lw=1.0, label=label)
@@ -238,6 +238,6 @@ def _draw_map(axes: Any, stats: EventStats) -> None:
     """Draw how often each pixel fires; black is the pixel at 99.5 %."""
     top = float(np.quantile(stats.pixel_counts, 0.995)) if stats.pixel_counts.size else 1.0
     axes.imshow(stats.pixel_counts, cmap="Greys", vmin=0.0, vmax=max(top, 1.0), interpolation="nearest")
-    axes.set_title(f"{stats.name}\n{stats.silent_share:.0%} silent pixels", fontsize=10, color=_INK)
+    axes.set_title(f"{stats.name}\n{100 * stats.silent_share:.0f} % silent pixels", fontsize=10, color=_INK)
     axes.set_xticks([])
     axes.set_yticks([])

@@ -365,6 +365,6 @@ def statistics(one: Observation) -> Numbers:
     interval_s = still.interval_s[calm[still.interval_pixel]]
     if len(interval_s):
         for share in (0.1, 0.5, 0.9):
-            shown[f"{share:.0%} of intervals below [s]"] = float(np.quantile(interval_s, share))
+            shown[f"{100 * share:.0f} % of intervals below [s]"] = float(np.quantile(interval_s, share))
     names = {"ON events a rise": "", "OFF events a fall": "", "busiest_hz": "busiest 0.2 ms [events/s]"}
     return shown | {names[key] or key: one.numbers[key] for key in names if key in one.numbers}

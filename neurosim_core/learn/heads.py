@@ -222,8 +222,8 @@ class FlowErrors(NamedTuple):
 
     def __str__(self) -> str:
         return (
-            f"endpoint error {self.endpoint_px:.3f} px, above 3 px {self.outliers:.1%}; where events are "
-            f"{self.events_endpoint_px:.3f} px, {self.events_outliers:.1%}"
+            f"endpoint error {self.endpoint_px:.3f} px, above 3 px {100 * self.outliers:.1f} %; "
+            f"where events are {self.events_endpoint_px:.3f} px, {100 * self.events_outliers:.1f} %"
         )
 
 

@@ -297,6 +297,13 @@ class PictureSensorConfig(RenderedConfig):
         """Names of all render outputs that it needs."""
         return frozenset([self.output])
 
+    @classmethod
+    def check_class(cls) -> None:
+        """Check the class when it is registered, and that it has an `output`."""
+        super().check_class()
+        if not hasattr(cls, "output"):
+            raise TypeError(f'{cls.__qualname__} must name a render output, such as output = "depth"')
+
     def render_request(self) -> RenderRequest:
         """Return its request to the renderer."""
         return RenderRequest(outputs=self.outputs, rate_hz=self.rate_hz)

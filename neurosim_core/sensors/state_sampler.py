@@ -387,6 +387,8 @@ def make_reader(
         is_scalar: Outputs are float64, the first number of the vec3d, in place of vec3d.
         late: Delay and dropouts; see `StateSampler`.
     """
+    if not isinstance(read, wp.Function):
+        raise TypeError(f"sensor {context.name!r}: it must read by a Warp function (@wp.func), got {read!r}")
     for each in errors.values() if is_scalar else ():
         for key in ("white", "walk", "markov", "resolution"):
             if isinstance(value := getattr(each, key), tuple):

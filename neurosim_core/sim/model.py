@@ -11,13 +11,14 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from neurosim_core.clock import Rate, to_ns
-from neurosim_core.config import SimulationConfig
+from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.garbage import pause_collection
 from neurosim_core.path_process import NotPlannedError, PlanningProcess
 from neurosim_core.render.renderer import upload_scene
@@ -67,7 +68,7 @@ class Model:
 
 
 def make_model(
-    config: SimulationConfig,
+    config: SimulationConfig | Mapping[str, Any] | str | FilePath | None,
     *,
     reader: SceneReader | None = None,
     on_phase: Callable[[str], None] | None = None,
@@ -76,7 +77,7 @@ def make_model(
     """Load or generate the scene, plan the path, and derive render groups and the schedule.
 
     Args:
-        config: Settings of a run with one vehicle.
+        config: Settings of a run with one vehicle, as `load_config` returns or accepts them.
         reader: Reads the scene in another process; None: this process reads it.
         on_phase: Called with the name of each part of the set-up when it begins.
         meanwhile: Called while light is baked and paths are planned, to compile kernels (`warm_flight`). Its
@@ -88,6 +89,7 @@ def make_model(
         ValueError: There are several vehicles, the scene cannot be loaded, no path exists, or the device is
             not there.
     """
+    config = config if isinstance(config, SimulationConfig) else load_config(config)
     if len(config.vehicles) > 1:
         raise ValueError(
             f"this flies one vehicle, got {', '.join(config.vehicles)}: `neurosim up` flies several at once"

@@ -322,6 +322,7 @@ def test_the_command_writes_a_file_that_says_where_it_is_from(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "v.mkv: 40x30; bgr0, 8 bits, srgb" in printed
     assert "4 in 0.060 s, every 20 ms" in printed
+    assert " % brighter), 0 dropped" in printed
     assert "does not name its transfer function" in printed
     with Recording(out) as flight:
         settings = yaml.safe_load(flight.header.config_yaml)["conversion"]
@@ -342,7 +343,9 @@ def test_the_command_replaces_nothing_unless_told_to(tmp_path, capsys):
     out.write_text("precious")
     line = ["convert", str(folder), str(out), "--fps", "10", "--device", "cpu"]
     assert cli.main(line) == 1
-    assert f"{out} is already there: add --overwrite" in capsys.readouterr().err
+    printed = capsys.readouterr()
+    assert f"{out} is already there: add --overwrite" in printed.err
+    assert printed.out == ""
     assert out.read_text() == "precious"
     assert cli.main([*line, "--overwrite"]) == 0
     assert cli.main(["convert", str(folder), str(tmp_path), "--fps", "10", "--overwrite"]) == 1

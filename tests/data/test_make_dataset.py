@@ -80,6 +80,7 @@ def test_what_is_in_it(whole):
     assert "--workers" not in card
     assert "| flights | 4, 0.8 s in all" in card
     assert "| depth | median " in card
+    assert "a generated scene `scene.seed + k // 2`" in card
     stream = data.Stream(whole, window_s=0.02, shuffle=True, fields=["events", "depth"])
     assert sum(len(batch) for batch in stream) == 40
     starts = []

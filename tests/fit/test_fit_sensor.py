@@ -225,7 +225,7 @@ def test_the_command_leaves_settings_and_a_picture(recordings, tmp_path, capsys,
     command = ["fit-sensor", "still.raw", "steps.raw", "--lux", "300", "--contrast", "4", "--rise", "0.02"]
     assert cli.main([*command, "--repeats", "2", "-o", "cam.yaml"]) == 0
     said = capsys.readouterr().out
-    for part in ("leak.rate_hz", "standard error", "simulation", "50% of intervals below [s]"):
+    for part in ("leak.rate_hz", "standard error", "simulation", "50 % of intervals below [s]"):
         assert part in said
     pixel = load_config("cam.yaml").sensors["events"].pixel
     assert pixel.threshold_on == pytest.approx(0.18, rel=0.03)

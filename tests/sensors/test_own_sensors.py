@@ -20,6 +20,7 @@ from neurosim_core.sensors import (
     FrameContext,
     FrameSensor,
     FrameSensorConfig,
+    ImageSensorConfig,
     Launches,
     RateHz,
     RenderRequest,
@@ -65,6 +66,8 @@ class HeightSampler(Sampler):
         shape = (context.slot_count, context.vehicle.count)
         if wrong == "slot":
             self.arrays = {"position": wp.zeros(context.vehicle.count, dtype=wp.vec3d, device="cpu")}
+        elif wrong == "reader":
+            ns.sensors.make_reader(context, lambda *_: 0.0, wp.float64(1.0), {}, Height, rate_hz=100.0)
         elif wrong != "arrays":
             self.arrays = {"position": wp.zeros(shape, dtype=wp.vec3d, device="cpu")}
 
@@ -100,6 +103,11 @@ def test_the_sensor_is_right_where_nothing_is_left_out(hover):
     ("wrong", "error", "said"),
     [
         ("arrays", TypeError, r"sensor 'height': HeightSampler must set `self\.arrays`"),
+        (
+            "reader",
+            TypeError,
+            r"sensor 'height': it must read by a Warp function \(@wp\.func\), got <function",
+        ),
         ("slot", ValueError, r"sensor 'height': arrays\['position'\] needs shape \[slot, world, \.\.\.\]"),
         ("row", KeyError, r"sensor 'height': no array 'positon' was measured, known: \['position'\]"),
         ("header", ValueError, r"packet\(\) must pass the header on: Height\(\.\.\., \*\*header\)"),
@@ -116,11 +124,12 @@ def test_a_sensor_that_never_gives_a_packet_is_said(hover, tmp_path, capsys):
     assert "height none of 6: its packet() returned None each time" in capsys.readouterr().out
 
 
-def class_with(**members: Any) -> type[StateSensorConfig]:
-    return type("OwnConfig", (StateSensorConfig,), {"__module__": __name__, **members})
+def class_with(*, base: type[Any] = StateSensorConfig, **members: Any) -> type[Any]:
+    return type("OwnConfig", (base,), {"__module__": __name__, **members})
 
 
-RATE = {"__annotations__": {"rate_hz": float}, "rate_hz": 100.0}
+KIND = {"__annotations__": {"kind": str}, "kind": "own"}
+RATE = {"__annotations__": {"kind": str, "rate_hz": float}, "kind": "own", "rate_hz": 100.0}
 
 
 @pytest.mark.parametrize(
@@ -128,7 +137,12 @@ RATE = {"__annotations__": {"rate_hz": float}, "rate_hz": 100.0}
     [
         (RATE, "OwnConfig.packet_type must be a subclass of ns.Packet, got None: add `packet_type = "),
         ({**RATE, "packet_type": Loose}, r"Loose\.air: the array needs axes, such as Annotated\["),
-        ({"packet_type": Height}, "OwnConfig needs a field `rate_hz: RateHz = 100.0`"),
+        ({**KIND, "packet_type": Height}, "OwnConfig needs a field `rate_hz: RateHz = 100.0`"),
+        ({"packet_type": Height}, r'OwnConfig needs a field `kind: Literal\["own"\] = "own"`'),
+        (
+            {**KIND, "base": ImageSensorConfig},
+            'OwnConfig must name a render output, such as output = "depth"',
+        ),
     ],
 )
 def test_what_a_class_lacks_is_said_when_it_is_registered(members, said):
