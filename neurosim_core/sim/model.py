@@ -159,14 +159,13 @@ def _make_fleet(
         context = executor.submit(wp.zeros, 1, device=device)  # creates the CUDA context
 
         def map_scene() -> FreeSpace:
-            geometry = reading.result()
             context.result()  # Warp makes a device's streams at its first use, which must be in one thread
-            return map_distances(geometry, config.free_space, device)
+            return map_distances(scene, config.free_space, device)
 
         def plan_in_other_process() -> tuple[FreeSpace, dict[str, Path]]:
             if reader is None or reader.planner is None:
                 raise NotPlannedError
-            return _plan_in_other_process(members, reader.planner, reading.result(), mapping.result)
+            return _plan_in_other_process(members, reader.planner, scene, mapping.result)
 
         def upload(scene: Scene) -> Any:
             context.result()
@@ -175,12 +174,10 @@ def _make_fleet(
         with phase("scene"):
             if reader is None:  # in this thread, where Ctrl-C interrupts it
                 scene = config.scene.load(pictures=has_cameras)
-                reading = executor.submit(lambda: scene)
             else:
-                reading = executor.submit(reader.geometry, config.scene)
+                scene = reader.scene(config.scene)
             mapping = executor.submit(map_scene)
             planning = executor.submit(plan_in_other_process)
-            scene = reading.result() if reader is None else reader.scene(config.scene)
             lighting = None
             if has_cameras:  # the placeholder loads the kernels of baked light: two threads must not
                 placeholder = None
