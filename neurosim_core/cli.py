@@ -153,7 +153,7 @@ def _add_serve(commands: _Commands) -> None:
 
 def _add_fly(commands: _Commands) -> None:
     fly = commands.add_parser("fly", help="run the controller that follows the path, in its own process")
-    add_settings(fly)
+    add_settings(fly, default="those of the simulator")
     fly.add_argument("--vehicle", metavar="NAME", help="vehicle to fly (default: all)")
     fly.add_argument(
         "--mode",
@@ -258,14 +258,18 @@ def _add_view(commands: _Commands) -> None:
         "--only", metavar="NAMES", help="live: show only these sensors, such as events,imu; others stay off"
     )
     view.add_argument(
-        "--event-window", type=float, default=0.02, metavar="S", help="event window of a picture [s]"
+        "--event-window",
+        type=float,
+        default=0.02,
+        metavar="S",
+        help="event window of a picture [s] (default: 0.02)",
     )
     view.add_argument(
         "--image-rate",
         type=float,
         default=15.0,
         metavar="HZ",
-        help="live: largest image rate of a sensor [Hz]; events have a separate limit",
+        help="live: largest image rate of a sensor [Hz] (default: 15); events have a separate limit",
     )
     view.add_argument("--port", type=int, default=0, help="--web: port of the page (default: any)")
     view.add_argument("--no-browser", action="store_true", help="--web: print the address only")

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -53,8 +54,8 @@ def new_folder(out: Path | None, *, overwrite: bool = False) -> Path:
 
 
 def fly(
-    config: SimulationConfig,
-    folder: Path,
+    config: SimulationConfig | Mapping[str, Any] | str | Path | None,
+    folder: str | Path,
     *,
     rerun: bool = True,
     console: Console | None = None,
@@ -69,7 +70,7 @@ def fly(
     when it is kept.
 
     Args:
-        config: What to fly.
+        config: What `load_config` returns or accepts.
         folder: Where to leave the flight; made if need be.
         rerun: Write flight.rrd, if that is among the sinks.
         console: Where to print; standard output if None.
@@ -81,6 +82,8 @@ def fly(
         OSError: The folder cannot be written to, or the disk is full.
         Exception: What a controller, sensor or sink of another package raises; the files hold all before.
     """
+    config = config if isinstance(config, SimulationConfig) else load_config(config)
+    folder = Path(folder)
     console = console or Console(soft_wrap=not sys.stdout.isatty())  # no lines broken in a pipe
     report = FlightReport()
     begin = time.perf_counter()

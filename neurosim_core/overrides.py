@@ -16,11 +16,12 @@ _OPTIONS = {"duration_s": "duration", "seed": "seed", "device": "device", "live.
 """Settings that have an option of their own."""
 
 
-def add_settings(parser: argparse.ArgumentParser) -> None:
-    """Let a command take what decides about a flight, which `load_settings` reads."""
-    parser.add_argument(
-        "config", nargs="?", type=Path, help="settings file (YAML); default: a generated apartment"
-    )
+def add_settings(parser: argparse.ArgumentParser, *, default: str = "a generated apartment") -> None:
+    """Let a command take what decides about a flight, which `load_settings` reads.
+
+    `default`: what it flies in without settings, for its help.
+    """
+    parser.add_argument("config", nargs="?", type=Path, help=f"settings file (YAML); default: {default}")
     parser.add_argument("--scene", type=Path, metavar="FILE", help="mesh file to fly in (.glb, .obj, ...)")
     parser.add_argument("--duration", type=float, metavar="S", help="simulated time [s]")
     parser.add_argument("--seed", type=int, help="seed of the sensor noise; data sets: of the first flight")

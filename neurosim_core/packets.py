@@ -124,7 +124,7 @@ class PacketSchema(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Packet:
-    """The header that every packet carries. Defining a subclass makes it known by its name."""
+    """The header of every packet. Defining a subclass registers it by its name."""
 
     display: ClassVar[str] = ""
     """How packets are shown in Rerun and in the overview: "image", "depth", "segmentation", "normals",

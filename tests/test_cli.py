@@ -395,7 +395,7 @@ def test_printed_settings_are_settings(tmp_path, capsys, command, live):
 
 def test_serve_has_its_scene_read_by_another_process(monkeypatch):
     def serve(config, *, reader, **_):
-        assert len(reader.geometry(config.scene).faces) > 12
+        assert len(reader.scene(config.scene).faces) > 12
         return 7
 
     monkeypatch.setattr(neurosim_core.live.serve, "serve", serve)

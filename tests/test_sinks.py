@@ -120,7 +120,8 @@ def test_the_overview_says_the_real_time_factor_of_the_report(scene, tmp_path, m
 
 
 def test_an_outside_sink_gets_what_the_recording_gets(scene, tmp_path):
-    ns.fly(settings(scene, mine={"kind": "test_list"}), tmp_path)
+    config = settings(scene, mine={"kind": "test_list"})
+    ns.fly(yaml.safe_load(ns.to_yaml(config)), str(tmp_path))  # as programs write it
     (sink,) = OPENED
     assert (sink.context.name, sink.context.folder, sink.context.stem) == ("mine", tmp_path, "flight")
     assert [s.name for s in sink.context.header.sensors] == ["events", "depth", "odometry"]

@@ -29,7 +29,9 @@ def add_parser(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     add_settings(parser)
     parser.add_argument("--flights", type=int, required=True, metavar="N", help="number of flights")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the data set")
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes; 0: this process")
+    parser.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="processes (default: 1); 0: this process"
+    )
     parser.add_argument(
         "--ray",
         nargs="?",
@@ -124,7 +126,9 @@ def add_compare_parser(commands: argparse._SubParsersAction[argparse.ArgumentPar
         "and on one page of plots.",
     )
     parser.add_argument("files", nargs="+", type=Path, help="files of events, or folders of them")
-    parser.add_argument("--out", type=Path, default=Path("compare.png"), help="PNG, PDF or SVG to write")
+    parser.add_argument(
+        "--out", type=Path, default=Path("compare.png"), help="PNG, PDF or SVG to write (./compare.png)"
+    )
     parser.add_argument("--size", metavar="WxH", help="resolution, for files that do not give it")
     parser.add_argument("--sensor", default="", metavar="NAME", help="event camera (default: the first)")
     parser.set_defaults(command=_compare)

@@ -44,40 +44,41 @@ def find_task(name: str) -> Task:
 
 
 class Env:
-    """A task in N worlds. Finished episodes begin anew within the step that ends them (SAME_STEP).
+    """A task in N worlds. A step that ends episodes also restarts them (SAME_STEP).
 
-    Observations, rewards and flags are tensors of the device. **Observations are valid until the next step**,
-    which overwrites event surfaces: clone what is to be kept. A step neither waits for a CUDA device
-    nor brings anything to the host; on a CPU it skips what no world needs.
+    Observations, rewards and flags are tensors on the device. **Observations are valid until the next step**,
+    which overwrites event surfaces: clone the tensors that you keep. A step neither waits for a CUDA device
+    nor copies anything to the host; on a CPU it skips work that no world needs.
 
     Args:
-        task: Its name in the registry ("hover", "hover-paper", ...), or a task.
-        worlds: N.
-        device: Where everything is: auto, cpu, cuda:0.
-        observe: Names of observations that are wanted; None: all. Without "events" nothing is rendered.
-        surface: How events are shown; None: as the task says.
-        scenes: Where to fly.
-        models: What `make_model` made of scenes, in place of `scenes`: nothing is loaded twice.
-        randomise: Draw parameters anew in each episode; as the task says, or as told.
-        pixels: Width and height of the event camera [px]; None: as the task says.
-        sensors: Further sensors by name, as in settings; what they yield is in `observation`.
-        seed: Of world 0; world i has seed + i.
+        task: Name of a task in the registry ("hover", "hover-paper", ...), or a task.
+        worlds: Number of worlds N.
+        device: Device of the worlds: auto, cpu, cuda:0.
+        observe: Names of the observations to compute; None: all. Without "events" nothing is rendered.
+        surface: Representation of events; None: that of the task.
+        scenes: "seen", "unseen", or scenes as for `Simulation`.
+        models: Models of the scenes from `make_model`, in place of `scenes`, so that nothing is loaded twice.
+        randomise: Draw parameters in each episode: True: those of the task; False: none; or a
+            `Randomisation`.
+        pixels: Width and height of the event camera [px]; None: those of the task.
+        sensors: Further sensors by name, as in settings; their results are in `observation`.
+        seed: Seed of world 0; world i has seed + i.
 
     Raises:
-        ValueError: There is no such task, or a setting is not for worlds.
+        ValueError: There is no such task, or a setting does not support worlds.
 
     Attributes:
-        task: What is done.
-        num_envs: N.
-        device: Of all tensors.
-        sim: The simulator.
-        view: What the task sees.
-        observation: What all sensors yielded last. Events are there until episodes begin anew, which on CUDA
-            is asked for in each step: read them in `Task.advance` or `watch`.
-        watch: Called in each step before episodes begin anew, and before the task sees it; None: nobody.
+        task: The task.
+        num_envs: Number of worlds N.
+        device: Device of all tensors.
+        sim: The simulation of the worlds.
+        view: The state of the worlds that the task reads.
+        observation: Last results of all sensors. Resets clear events, on CUDA in every step: read events in
+            `Task.advance` or `watch`.
+        watch: Function that each step calls before the task and before resets; None: none.
         episode_steps: Steps after which an episode is truncated.
         action_count: Numbers in an action, each in [-1, 1].
-        episode_length: Steps since each episode began, int32, shape [N].
+        episode_length: Steps since the begin of each episode, int32, shape [N].
     """
 
     def __init__(

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TextIO
 
 from rich.console import Console
-from rich.markdown import Markdown
 from rich.status import Status
 from rich.table import Table
 
@@ -19,7 +18,7 @@ from cortex import Node
 from cortex.messages import SimulatorStatus
 from neurosim_core.config import SimulationConfig
 from neurosim_core.garbage import no_collection
-from neurosim_core.live.call import describe_status
+from neurosim_core.live.call import show_status
 from neurosim_core.live.simulator import Simulator
 from neurosim_core.live.topics import SIMULATION, command_topic
 from neurosim_core.live.vehicle import VehicleNode
@@ -78,7 +77,7 @@ def serve(
                 simulator.status.on_status = line.show
                 code = simulator.run(stop)
             if line.last is not None:
-                console.print(Markdown(describe_status(line.last, phase=False)))  # which was said
+                console.print(show_status(line.last, phase=False))  # which was said
             for vehicle in simulator.vehicles:
                 if count := vehicle.state.counts["redone intervals"]:
                     console.print(f"{vehicle.name}: adaptive steps replaced {count:,} fixed ones")

@@ -46,6 +46,8 @@ class Part:
     """The message to the user when it has ended and the others go on."""
     is_prefixed: bool = True
     """Whether its lines are printed behind its name."""
+    writes_file: bool = False
+    """Whether it writes a file: it has all the time it needs to complete it, until a second signal."""
 
 
 def up(config: SimulationConfig, *, viewer: str, record: Path | None, overwrite: bool) -> int:
@@ -67,7 +69,12 @@ def up(config: SimulationConfig, *, viewer: str, record: Path | None, overwrite:
         recording = [] if record is None else ["--record", str(record), *["--overwrite"] * overwrite]
         streaming = config.live.mode == "streaming"
         parts = [
-            Part(name="simulator", command=_neurosim("serve", str(settings), *recording), is_prefixed=False),
+            Part(
+                name="simulator",
+                command=_neurosim("serve", str(settings), *recording),
+                is_prefixed=False,
+                writes_file=record is not None,
+            ),
             Part(
                 name="controller",
                 command=_neurosim("fly", str(settings)),
@@ -82,6 +89,7 @@ def up(config: SimulationConfig, *, viewer: str, record: Path | None, overwrite:
                     command=_neurosim("view", *viewer_arguments),
                     at_its_end="go on",
                     advice="the flight goes on (neurosim view opens another)",
+                    writes_file="--save" in viewer_arguments,
                 )
             )
         return run_together(parts, console=Console(highlight=False))
@@ -119,8 +127,9 @@ def run_together(parts: Sequence[Part], *, console: Console, grace_s: float = GR
     """Run processes until one ends that all others end with, or a signal comes; leave none behind.
 
     Each process leads a session of its own, so that Ctrl-C reaches only this one. SIGINT, SIGTERM and SIGHUP
-    end all: each process gets SIGINT, and is killed after a grace, or at a second signal. When a process has
-    ended, what it left in its session is killed. If this process is killed, the others get SIGINT (on Linux).
+    end all: each process gets SIGINT, and is killed after a grace, unless it writes a file, or at a second
+    signal. When a process has ended, what it left in its session is killed. If this process is killed, the
+    others get SIGINT (on Linux).
     For the main thread. `console`: where to print what they print, standard error included. `grace_s`: how
     long a process may take to end [s]. Returns the exit status of the process that ended all, 1 if a signal
     killed it; 130 after a signal; else 0.
@@ -229,13 +238,13 @@ def _end(children: Sequence[_Child], console: Console, caught: Sequence[int], gr
     begin_s, caught_before = time.monotonic(), len(caught)
     while running := [child for child in running if child.poll() is None]:
         waited_s = time.monotonic() - begin_s
-        if waited_s >= grace_s or len(caught) > caught_before:
-            break
+        is_late, at_once = waited_s >= grace_s, len(caught) > caught_before
+        for child in running:
+            if at_once or (is_late and not child.part.writes_file):
+                child.kill()
+                with contextlib.suppress(OSError):  # the console is gone
+                    _say(console, f"{child.part.name} had not ended after {waited_s:.1f} s and was killed")
         time.sleep(_LOOK_S)
-    for child in running:
-        child.kill()
-        with contextlib.suppress(OSError):  # the console is gone
-            _say(console, f"{child.part.name} had not ended after {waited_s:.1f} s and was killed")
 
 
 def _describe(status: int) -> str:

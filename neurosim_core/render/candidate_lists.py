@@ -117,7 +117,8 @@ def choose_candidate_lists(
         return requested
     widest = max((pixel_rad for least, pixel_rad in _AUTO if instant_count >= least), default=0.0)
     sample_count = max(1, len(rays) - 1)  # each of which has its share of the pixel
-    pixel_rad = float(np.quantile(rays[..., 3], 0.5)) * math.sqrt(sample_count)
+    spreads_rad = np.sort(rays[..., 3], axis=None)  # np.median imports numpy.ma
+    pixel_rad = float(spreads_rad[len(spreads_rad) // 2]) * math.sqrt(sample_count)
     small = pixel_rad <= widest and face_count * pixel_rad**2 <= _AUTO_FACES_MAX
     pays = small if is_cuda else not embree
     return CandidateListConfig() if pays and looks_forward(rays) else None

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from neurosim_core.scene.config import SceneConfig
     from neurosim_core.scene.scene import Scene
 
-_GEOMETRY, _SCENE, _PICTURES, _CONNECTIONS = range(4)
+_SCENE, _REFINED, _PICTURES, _CONNECTIONS = range(4)
 """What the process answers."""
 _ALIGNMENT = 64
 _KEEP_MEMORY = {
@@ -74,21 +74,17 @@ class SceneReader:
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
 
-    def geometry(self, config: SceneConfig) -> Scene:
-        """Wait for the triangles; return the scene without materials, some time before `scene` has all of it.
+    def scene(self, config: SceneConfig) -> Scene:
+        """Wait for the triangles, and return their scene.
 
-        `config` has the settings, checked.
+        Its pictures, its refined mesh and its connections come later: an access waits for them, and raises a
+        NotReadError if the process has ended before they were there.
+
+        Args:
+            config: The checked settings.
 
         Raises:
             NotReadError: The process could not read it, or read other settings.
-        """
-        return self._answer(_GEOMETRY, config)
-
-    def scene(self, config: SceneConfig) -> Scene:
-        """Wait for the scene and return it; argument and errors as above.
-
-        Its pictures and its connections come later: who looks at them waits, and gets a NotReadError if the
-        process has ended before they were there.
         """
         from neurosim_core.scene.scene import Texture
 
@@ -107,6 +103,7 @@ class SceneReader:
                 dataclasses.replace(material, texture=textures.get(k))
                 for material, k in zip(scene.materials, texture_of, strict=True)
             ),
+            refine=partial(self._answer, _REFINED, config),
             connect=partial(self._answer, _CONNECTIONS, config),
         )
 
@@ -176,22 +173,25 @@ def _read(settings: Mapping[str, Any], write: Callable[[int, object], None]) -> 
             os._exit(0)
     os.close(receiving)
     scene = load_mesh_scene(config, decode=False) if isinstance(config, MeshSceneConfig) else config.load()
-    write(_GEOMETRY, (config, dataclasses.replace(scene, materials=())))
     textures = list(dict.fromkeys(m.texture for m in scene.materials if m.texture is not None))
-    with open(sending, "wb") as asking:
-        pickle.dump(textures, asking, protocol=5)
+    plain = tuple(dataclasses.replace(material, texture=None) for material in scene.materials)
+    texture_of = [None if m.texture is None else textures.index(m.texture) for m in scene.materials]
+    names = [texture.name for texture in textures]
+    write(_SCENE, (config, (dataclasses.replace(scene, materials=plain), names, texture_of)))
+
+    def send() -> None:
+        with open(sending, "wb") as asking:
+            pickle.dump(textures, asking, protocol=5)
+
+    threading.Thread(target=send).start()  # of decoded pictures this can be 100 MB and more
     from neurosim_core.render.config import RenderConfig
     from neurosim_core.render.refine import refine_within
 
     render = RenderConfig.model_validate(settings["render"])
     edge_m = render.lighting.edge_max_m if render.lighting.mode == "baked" else None
     if (mesh := refine_within(scene, edge_m)) is not None:
-        scene.refined[edge_m] = mesh
         _ = mesh.corner_groups, mesh.corner_normals
-    plain = tuple(dataclasses.replace(material, texture=None) for material in scene.materials)
-    texture_of = [None if m.texture is None else textures.index(m.texture) for m in scene.materials]
-    names = [texture.name for texture in textures]
-    write(_SCENE, (config, (dataclasses.replace(scene, materials=plain), names, texture_of)))
+    write(_REFINED, (config, {} if mesh is None else {edge_m: mesh}))
     if render.samples_per_pixel == "adaptive":
         write(_CONNECTIONS, (config, scene.connections))
     os.waitpid(child, 0)  # it ends with this one

@@ -179,8 +179,8 @@ class Scene:
     """What was subtracted from the coordinates of the file, in metres and with z up, as float32 could not
     tell places apart so far from its zero [m]."""
 
-    refined: dict[float | None, RefinedMesh] = field(default_factory=dict)
-    """Meshes that `render.refine` has made of it beforehand, by their longest edge [m]."""
+    refine: Callable[[], Mapping[float | None, RefinedMesh]] | None = None
+    """Returns meshes that `render.refine` has made of it elsewhere, by their longest edge [m]; None: none."""
     connect: Callable[[], tuple[NDArray[np.int32], NDArray[np.int32]]] | None = None
     """Returns what `connect_faces` has returned elsewhere; None: it is called here."""
 
@@ -188,6 +188,11 @@ class Scene:
         """Refuse what renderers cannot show: a GPU would look for its tree in memory that is not there."""
         if len(self.faces) == 0:
             raise ValueError(f"a scene must have triangles, and {self.name!r} has none")
+
+    @cached_property
+    def refined(self) -> Mapping[float | None, RefinedMesh]:
+        """The result of `refine`."""
+        return {} if self.refine is None else self.refine()
 
     @cached_property
     def connections(self) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

@@ -11,13 +11,14 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from neurosim_core.clock import Rate, to_ns
-from neurosim_core.config import SimulationConfig
+from neurosim_core.config import SimulationConfig, load_config
 from neurosim_core.garbage import pause_collection
 from neurosim_core.path_process import NotPlannedError, PlanningProcess
 from neurosim_core.render.renderer import upload_scene
@@ -67,7 +68,7 @@ class Model:
 
 
 def make_model(
-    config: SimulationConfig,
+    config: SimulationConfig | Mapping[str, Any] | str | FilePath | None,
     *,
     reader: SceneReader | None = None,
     on_phase: Callable[[str], None] | None = None,
@@ -76,7 +77,7 @@ def make_model(
     """Load or generate the scene, plan the path, and derive render groups and the schedule.
 
     Args:
-        config: Settings of a run with one vehicle.
+        config: Settings of a run with one vehicle, as `load_config` returns or accepts them.
         reader: Reads the scene in another process; None: this process reads it.
         on_phase: Called with the name of each part of the set-up when it begins.
         meanwhile: Called while light is baked and paths are planned, to compile kernels (`warm_flight`). Its
@@ -88,6 +89,7 @@ def make_model(
         ValueError: There are several vehicles, the scene cannot be loaded, no path exists, or the device is
             not there.
     """
+    config = config if isinstance(config, SimulationConfig) else load_config(config)
     if len(config.vehicles) > 1:
         raise ValueError(
             f"this flies one vehicle, got {', '.join(config.vehicles)}: `neurosim up` flies several at once"
@@ -157,14 +159,13 @@ def _make_fleet(
         context = executor.submit(wp.zeros, 1, device=device)  # creates the CUDA context
 
         def map_scene() -> FreeSpace:
-            geometry = reading.result()
             context.result()  # Warp makes a device's streams at its first use, which must be in one thread
-            return map_distances(geometry, config.free_space, device)
+            return map_distances(scene, config.free_space, device)
 
         def plan_in_other_process() -> tuple[FreeSpace, dict[str, Path]]:
             if reader is None or reader.planner is None:
                 raise NotPlannedError
-            return _plan_in_other_process(members, reader.planner, reading.result(), mapping.result)
+            return _plan_in_other_process(members, reader.planner, scene, mapping.result)
 
         def upload(scene: Scene) -> Any:
             context.result()
@@ -173,12 +174,10 @@ def _make_fleet(
         with phase("scene"):
             if reader is None:  # in this thread, where Ctrl-C interrupts it
                 scene = config.scene.load(pictures=has_cameras)
-                reading = executor.submit(lambda: scene)
             else:
-                reading = executor.submit(reader.geometry, config.scene)
+                scene = reader.scene(config.scene)
             mapping = executor.submit(map_scene)
             planning = executor.submit(plan_in_other_process)
-            scene = reading.result() if reader is None else reader.scene(config.scene)
             lighting = None
             if has_cameras:  # the placeholder loads the kernels of baked light: two threads must not
                 placeholder = None

@@ -62,9 +62,9 @@ class Multirotor:
     captured in a CUDA graph. Rotor speed commands outside the range of the rotors saturate, as they do in a
     motor controller.
 
-    An interval is what one call of `advance` covers, cut at the ticks of turbulence. It is flown in equal
-    steps of RKMK4 (`rkmk4.py`). Where these do not resolve the motion of a vehicle, its interval is flown
-    again from its beginning in adaptive steps of Dormand-Prince 5(4) (`dormand_prince.py`), on the device,
+    An interval is the duration of one call of `advance`, cut at the ticks of turbulence. It is integrated in
+    equal steps of RKMK4 (`rkmk4.py`). If these do not resolve the motion of a vehicle, its interval is
+    repeated from its beginning in adaptive steps of Dormand-Prince 5(4) (`dormand_prince.py`), on the device,
     and counted (`effort`). The criterion is RK4's embedded difference h/6 |k1 - k2 - k3 + k4| on velocity and
     body rate, against sqrt(1e-3^2 + (2e-3 |.|)^2); it catches blow-up and is no estimate of accuracy. A
     vehicle that adaptive steps cannot move either stops at the beginning of the interval: its `status` is set

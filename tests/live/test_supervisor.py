@@ -211,12 +211,15 @@ def test_who_does_not_end_in_time_is_killed(start):
     assert len(lines) == 2
 
 
-def test_a_second_signal_kills_at_once(start):
-    """The grace is that of the fixture, which is longer than the test waits."""
-    supervisor = start(part("simulator"), part("controller", STUBBORN), grace_s=1000.0)
+@pytest.mark.parametrize(("grace_s", "writes_file"), [(1000.0, False), (0.1, True)])
+def test_a_second_signal_kills_at_once(start, grace_s, writes_file):
+    """What writes a file has all the time until then."""
+    stubborn = part("controller", STUBBORN, writes_file=writes_file)
+    supervisor = start(part("simulator"), stubborn, grace_s=grace_s)
     supervisor.read_until(*ready("simulator", "controller"))
     supervisor.interrupt()
     supervisor.read_until("simulator: closed")
+    time.sleep(0.5)  # the grace of others is over
     supervisor.interrupt()
     assert any(line.startswith("controller had not ended after") for line in supervisor.rest())
     assert supervisor.process.returncode == 130

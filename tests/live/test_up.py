@@ -67,8 +67,10 @@ def test_only_the_simulator_records(up):
     assert arguments(parts["simulator"], after=5) == ["--record", "flight", "--overwrite"]
     assert arguments(parts["controller"], after=5) == []
     assert arguments(parts["viewer"]) == ["view", "--save", "live.rrd"]
+    assert [part.name for part in parts.values() if part.writes_file] == ["simulator", "viewer"]
     parts, _ = up(SimulationConfig(), record=Path("flight"))
     assert arguments(parts["simulator"], after=5) == ["--record", "flight"]
+    assert not any(part.writes_file for part in up(SimulationConfig())[0].values())
 
 
 @pytest.mark.parametrize(("mode", "at_its_end"), [("lockstep", "end if it failed"), ("streaming", "go on")])

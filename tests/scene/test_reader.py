@@ -53,16 +53,13 @@ def test_it_is_the_scene_that_is_loaded_here(tmp_path, monkeypatch):
     loaded = config.load()
     monkeypatch.setattr(MeshSceneConfig, "load", None)
     with SceneReader({"scene": {"file": str(file)}}) as reader:
-        geometry = reader.geometry(config)
         scene = reader.scene(config)
         pairs = [(m.texture, n.texture) for m, n in zip(scene.materials, loaded.materials, strict=True)]
         pictures = [one and (one.srgb, one.pack_levels()) for one, _ in pairs]
-        connections = scene.connections
-    for name in ("vertices", "faces", "normals"):
-        np.testing.assert_array_equal(getattr(geometry, name), getattr(loaded, name), strict=True)
+        (mesh,), connections = scene.refined.values(), scene.connections
     for name, values in arrays_of(loaded).items():
         np.testing.assert_array_equal(getattr(scene, name), values, strict=True)
-    (mesh,), wanted = scene.refined.values(), refine(loaded, 0.5)
+    wanted = refine(loaded, 0.5)
     for field in dataclasses.fields(wanted):
         np.testing.assert_array_equal(getattr(mesh, field.name), getattr(wanted, field.name), strict=True)
     assert len(mesh.faces) > len(loaded.faces)
@@ -88,9 +85,8 @@ def test_it_is_the_scene_that_is_loaded_here(tmp_path, monkeypatch):
 def test_what_the_process_has_not_read_is_read_here(tmp_path, settings):
     config = MeshSceneConfig.model_validate(room_scene(tmp_path))
     with SceneReader({"scene": settings}) as reader:
-        for read in (reader.geometry, reader.scene):
-            with pytest.raises(NotReadError):
-                read(config)
+        with pytest.raises(NotReadError):
+            reader.scene(config)
         assert make_model(settings_in(config), reader=reader).scene.name == "room"
 
 
@@ -193,7 +189,7 @@ def test_a_process_that_ends_too_early_is_done_without(tmp_path):
     before = children_of(os.getpid())
     with SceneReader({"scene": config.model_dump(mode="json")}) as reader:
         (pid,) = children_of(os.getpid()) - before
-        reader.geometry(config)
+        reader.scene(config)
         os.kill(pid, signal.SIGKILL)
         assert make_model(settings_in(config), reader=reader).scene.name == "room"
 

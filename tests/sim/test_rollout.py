@@ -318,7 +318,7 @@ def test_an_unknown_device_is_named(settings):
 
 @pytest.fixture
 def outside_model(settings) -> sim.Model:
-    return sim.make_model(ns.load_config(settings))
+    return sim.make_model(settings)
 
 
 def hover(model: sim.Model) -> np.ndarray:
