@@ -135,7 +135,7 @@ def test_the_other_commands(tmp_path, monkeypatch, capsys):
         assert cli.main(shlex.split(command)[1:]) == 0, f"{command}: {capsys.readouterr().err}"
         return capsys.readouterr().out
 
-    for command in sorted(listed, key=lambda c: "print-config" not in c):  # makes scene.yaml first
+    for command in listed:
         if re.search(
             "convert|neurosim scene|bench all", command
         ):  # in tests/convert, tests/scene, tests/bench

@@ -95,7 +95,8 @@ def _check_native() -> str:
         reason = str(error)
     else:
         reason = "it is of another version of cortex"
-    raise Fault(f"{reason}. All works, more slowly. Install a C compiler, then `pip install -e .` again")
+    install = "Install a C compiler and Python's headers, then `pip install -e .` again"
+    raise Fault(f"{reason}. All works, more slowly. {install}")
 
 
 def _check_memory() -> str:

@@ -178,8 +178,12 @@ def _read(settings: Mapping[str, Any], write: Callable[[int, object], None]) -> 
     texture_of = [None if m.texture is None else textures.index(m.texture) for m in scene.materials]
     names = [texture.name for texture in textures]
     write(_SCENE, (config, (dataclasses.replace(scene, materials=plain), names, texture_of)))
-    with open(sending, "wb") as asking:
-        pickle.dump(textures, asking, protocol=5)
+
+    def send() -> None:
+        with open(sending, "wb") as asking:
+            pickle.dump(textures, asking, protocol=5)
+
+    threading.Thread(target=send).start()  # of decoded pictures this can be 100 MB and more
     from neurosim_core.render.config import RenderConfig
     from neurosim_core.render.refine import refine_within
 

@@ -17,6 +17,7 @@ from types import SimpleNamespace
 
 import pytest
 import zmq
+from c_module import needs_native
 from peer import Block, Number, accounted, connect, is_whole, make_block, stand_still, take_all
 from processes import SOON_S, Beside, wait_for
 
@@ -27,7 +28,7 @@ from cortex.broadcast import Listener
 from cortex.compiled import native
 from cortex.wire import MESSAGE, AttachKey, Header, attach_key, message_head, pack_header
 
-pytestmark = pytest.mark.skipif(native is None, reason="no C module")
+pytestmark = needs_native
 
 
 SOURCE = 7

@@ -8,6 +8,7 @@ import signal
 import time
 
 import pytest
+from c_module import needs_native
 from peer import Block, connect, make_block
 from processes import SOON_S, Beside, wait_for
 
@@ -153,6 +154,7 @@ def test_a_forked_child_leaves_a_publisher_alone(make_node, use):
 
 
 @pytest.mark.parametrize("policy", ["reliable", "keep_last"])
+@needs_native
 def test_what_a_reader_has_no_time_for_is_counted(make_node, start_child, policy):
     """It stands still until its publisher has given up."""
     node = make_node()
@@ -174,6 +176,7 @@ def test_what_a_reader_has_no_time_for_is_counted(make_node, start_child, policy
 
 
 @pytest.mark.parametrize("policy", [["keep_last"], ["latest"], ["reliable"]], ids=lambda policy: policy[0])
+@needs_native
 def test_a_publisher_that_dies_after_its_first_large_message(start_child, policy):
     """Nobody can map its memory any more: the subscriber goes on, and accounts for every message."""
     subscriber = start_child("endless_subscriber", topic="/blocks", policy=policy)

@@ -22,6 +22,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import pytest
+from c_module import needs_native
 from hypothesis import given
 from hypothesis import strategies as st
 from peer import Number, Scan
@@ -271,6 +272,7 @@ def test_top_shows_all_topics_with_rates_and_losses(make_node):
         wait_for(is_right)
 
 
+@needs_native
 def test_doctor_finds_nothing_wrong_here_and_says_what_is(tmp_path):
     environment = {"XDG_CONFIG_HOME": str(tmp_path)}
     status, output, _ = cortex("doctor", environment=environment)
@@ -288,6 +290,17 @@ def test_doctor_finds_nothing_wrong_here_and_says_what_is(tmp_path):
         status, output, _ = cortex("doctor", environment=open_to_all)
     assert status == 1
     assert "chmod 700" in output.splitlines()[0]
+
+
+def test_doctor_says_what_a_machine_without_a_compiler_lacks(tmp_path):
+    code = (
+        "import sys; sys.modules['cortex._native'] = None\n"  # no such module
+        "from cortex.cli import main; sys.exit(main(['doctor']))"
+    )
+    environment = {**os.environ, "XDG_CONFIG_HOME": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "Install a C compiler and Python's headers, then `pip install -e .` again\n" in done.stdout
 
 
 def test_types_are_compared(make_node, tmp_path):

@@ -9,11 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from c_module import needs_native
 
-from cortex.compiled import native
 from cortex.message_types import message
-
-needs_native = pytest.mark.skipif(native is None, reason="cortex._native was not compiled")
 
 
 @message

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import zmq
+from c_module import needs_native
 from directories import (
     LEASE_S,
     TYPES,
@@ -104,6 +105,7 @@ def test_who_died_with_the_registry_is_dropped_after_a_lease(make):
     assert one.ever_lost == {dead.id}
 
 
+@needs_native
 def test_a_killed_node_disappears_with_its_files(make, start_child):
     """Long before it would, were it alive and silent, and before its lease has run out: the kernel tells."""
 

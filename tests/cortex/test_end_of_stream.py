@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from c_module import needs_native
 from cpp_client import Impostor, Peer, make_frame
 from cpp_messages import Scan
 from cpp_programs import needs_compiler, programs
@@ -183,6 +184,7 @@ def await_confirmed(leavers: Leavers, source: int, sequence: int) -> None:
 
 
 @pytest.mark.parametrize("language", ["Python", pytest.param("C++", marks=needs_compiler)])
+@needs_native
 def test_what_went_through_a_ring_that_cannot_be_mapped_is_lost(
     request, runtime, leavers, monkeypatch, language
 ):

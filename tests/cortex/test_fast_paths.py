@@ -6,13 +6,13 @@ import sys
 import time
 
 import pytest
+from c_module import needs_native
 from peer import Number, Scan, connect, make, stand_still
 from processes import SOON_S, Beside
 
-from cortex.compiled import native
 from cortex.policy import reliable
 
-pytestmark = pytest.mark.skipif(native is None, reason="cortex._native was not compiled")
+pytestmark = needs_native
 
 
 @pytest.mark.usefixtures("sockets_alone")

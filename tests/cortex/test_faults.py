@@ -15,6 +15,7 @@ import time
 
 import numpy as np
 import pytest
+from c_module import needs_native
 from peer import Block, accounted, is_whole, make_block, slots_held, take
 from processes import SOON_S, Beside, fork_server, processes_with, shared_mappings, wait_for
 
@@ -87,6 +88,7 @@ def registry_pid(base):
 
 
 @pytest.mark.parametrize("policy", [keep_last(8), reliable(4, 60.0)], ids=str)
+@needs_native
 def test_publishers_are_killed(make_node, start_child, runtime, tmp_path, policy):
     """Whatever it was doing: what has arrived is whole, and stays so; the next publisher is heard.
 
@@ -139,6 +141,7 @@ def test_publishers_are_killed(make_node, start_child, runtime, tmp_path, policy
 
 
 @pytest.mark.parametrize("policy", POLICIES, ids=lambda policy: policy[0])
+@needs_native
 def test_subscribers_are_killed(make_node, start_child, runtime, policy):
     """While they hold messages and wait for more: the leases are back at once, the publisher goes on.
 
@@ -275,6 +278,7 @@ def test_a_publisher_is_stopped(make_node, start_child, runtime):
 
 @pytest.mark.parametrize(("limit", "shared"), [(100_000, 0), (1_000_000, 2)], ids=["a ring", "slots"])
 @pytest.mark.parametrize("policy", [keep_last(8), reliable(8, SOON_S)], ids=str)
+@needs_native
 def test_no_memory(make_node, start_child, runtime, policy, limit, shared):
     """A limit on the size of files stands for a full memory: messages go through the socket, in order."""
     child = start_child("peer", limit_file_bytes=limit)
@@ -294,6 +298,7 @@ def test_no_memory(make_node, start_child, runtime, policy, limit, shared):
 
 
 @pytest.mark.parametrize("policy", [POLICIES[0], ["reliable", {"depth": 4, "timeout_s": 0.05}]], ids=str)
+@needs_native
 def test_no_memory_for_slots_and_a_reader_that_stands_still(start_child, runtime, policy):
     """The publisher waits for its time only; what came before is there, and what is lost is counted once."""
     child, reader = start_child("peer", limit_file_bytes=1_000_000), start_child("peer")

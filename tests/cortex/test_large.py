@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from c_module import needs_native
 from peer import (
     Block,
     Scan,
@@ -35,6 +36,7 @@ import cortex.link
 from cortex import Closed, keep_last, latest, reliable
 from cortex.pub_socket import Backoff
 
+pytestmark = needs_native
 LARGE = 100_000
 
 

@@ -11,6 +11,7 @@ import struct
 
 import pytest
 import zmq
+from c_module import needs_native
 from damage import mutate
 from peer import Number, Scan, make, take_all
 from processes import SOON_S, wait_for
@@ -214,6 +215,7 @@ def test_a_number_from_nowhere_does_not_end_the_stream(make_feed, kind, jump):
 
 @pytest.mark.parametrize("through", ["socket", "ring"])
 @pytest.mark.parametrize("kind", [Number, Scan])
+@needs_native
 def test_mutated_frames_never_hurt(make_feed, kind, through):
     """Whatever comes, the next good message arrives."""
     feed, rng = make_feed(kind, through=through), random.Random(1)

@@ -10,6 +10,7 @@ import warnings
 
 import numpy as np
 import pytest
+from c_module import needs_native
 from peer import Scan, make_block
 from processes import SOON_S, Beside, wait_for
 from test_large import connected, scan, slots_held
@@ -17,6 +18,7 @@ from test_large import connected, scan, slots_held
 from cortex import Loan, Publisher, keep_last, reliable
 from cortex.messages import Image
 
+pytestmark = needs_native
 LARGE = 50_000
 FORGOTTEN = "/large: a loan was forgotten, neither published nor dropped"
 

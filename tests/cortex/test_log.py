@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from c_module import needs_native
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from peer import Block as Large
@@ -206,6 +207,7 @@ def test_best_effort_counts_what_it_loses(node, tmp_path):
         assert ended["written"] + ended["lost"] + ended["overtaken"] == published
 
 
+@needs_native
 def test_a_publisher_that_was_killed_is_counted(make_node, tmp_path, start_child):
     """The file does not say that all is in it."""
     node = make_node()

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from c_module import needs_native
 from damage import mutate, outcome
 from hypothesis import given
 from hypothesis import strategies as st
@@ -33,7 +34,7 @@ from cortex.messages import Image
 from cortex.native import make_coder
 from cortex.schema import Schema, schema_of, type_from_schema
 
-pytestmark = pytest.mark.skipif(native is None, reason="cortex._native was not compiled")
+pytestmark = needs_native
 
 
 def python_body(value: Any) -> bytes:

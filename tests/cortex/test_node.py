@@ -14,6 +14,7 @@ import weakref
 
 import pytest
 import zmq
+from c_module import needs_native
 from peer import Number, OtherNumber, Scan, connect
 from processes import ROOT, SOON_S, Beside, wait_for
 
@@ -200,6 +201,7 @@ def test_what_is_closed_is_forgotten(make_node):
     wait_for(forgotten, every_s=0.02)
 
 
+@needs_native
 def test_no_files_are_left(make_node):
     node = make_node("one", listen="127.0.0.1")
     names = set(os.listdir(runtime_dir(0)))

@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+from c_module import needs_native
 from peer import Number, Scan, accounted, connect, memory, take, take_all
 from processes import SOON_S, wait_for
 
@@ -42,6 +43,7 @@ def test_policies_say_what_they_are():
 
 
 @pytest.mark.parametrize("depth", [1, 5, 64, 100])
+@needs_native
 def test_keep_last_hands_out_exactly_the_last(node, depth):
     """Whatever was published while nobody looked; the others were overtaken, none was lost."""
     publisher, subscriber = connected(node, keep_last(depth))
@@ -52,6 +54,7 @@ def test_keep_last_hands_out_exactly_the_last(node, depth):
     assert (counters.received, counters.overtaken, counters.lost) == (depth, 700 - depth, 0)
 
 
+@needs_native
 def test_latest_gives_the_newest_at_once(node):
     """Each time that it is asked, however many have come since."""
     publisher, subscriber = connected(node, latest())
@@ -142,6 +145,7 @@ def test_back_pressure_has_an_end(node):
     assert publisher.counters.timeouts >= lost
 
 
+@needs_native
 def test_a_reader_of_large_messages_that_is_late_holds_up_once(node):
     """Until it has read about half it loses messages, which `publish` says, and nobody waits for it."""
     publisher, subscriber = connect(node, "/scans", Scan, reliable(depth=4, timeout_s=1.0))

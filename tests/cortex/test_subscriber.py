@@ -13,6 +13,7 @@ import time
 import numpy as np
 import pytest
 import zmq
+from c_module import needs_native
 from peer import Number, OtherNumber, Scan, connect
 from processes import SOON_S, Beside, in_time, wait_for
 
@@ -132,6 +133,7 @@ def test_what_is_known_of_a_message(node, numbers):
         assert info.size == codec_of(Number).fixed_size
 
 
+@needs_native
 def test_arrays_cannot_be_written(node):
     publisher, subscriber = connect(node, "/scans", Scan)
     for size in (10, LARGE):
@@ -310,6 +312,7 @@ def test_the_connection_to_a_publisher_that_left_is_closed(node, policy, how, mo
     assert subscriber.counters.lost == 0
 
 
+@needs_native
 def test_a_publisher_that_left_is_let_go_while_another_waits_for_room(node):
     """All that came of it was read; that more of the other is in flight is nothing to it."""
     subscriber = node.subscriber("/numbers", Number, policy=reliable(4, 60.0))

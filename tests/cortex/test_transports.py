@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import zmq
+from c_module import needs_native
 from peer import Block, Number, is_whole, make_block
 from processes import SOON_S
 
@@ -55,6 +56,7 @@ def pair(make_node, start_child, runtime, tmp_path):
 
 @pytest.mark.parametrize("policy", [["keep_last"], ["reliable", {"depth": 8, "timeout_s": 60.0}]], ids=str)
 @pytest.mark.parametrize("transport", TRANSPORTS)
+@needs_native
 def test_between_processes(pair, transport, policy):
     """Both ways: we publish and they check, then they publish and we check."""
     node, child = pair(transport)
