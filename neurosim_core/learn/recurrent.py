@@ -103,7 +103,8 @@ class RecurrentPpo:
         for rows in minibatches(self.env.num_envs, len(self._rows), config, self._generator):
             self._rows.copy_(rows)
             self.descent.step(config.learning_rate * (1.0 - 0.9 * done))
-        return log | {"hint": float(self._hint_error) / (config.epochs * config.minibatches)}
+        error = float(self._hint_error) / (config.epochs * config.minibatches)
+        return log | {f"{self.env.task.hint} error": error}
 
     def _fly(self) -> dict[str, float]:
         config, env, kept = self.config, self.env, self._kept

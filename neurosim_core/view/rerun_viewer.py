@@ -185,7 +185,10 @@ def show_file(file: Path, *, web: bool, port: int = 0, open_browser: bool = True
     ):
         if web:
             print(f"open {viewer.page_url}", flush=True)
-            _send(file, viewer.data_url)
+            # a thread: Rerun waits for a server that takes nothing, and Ctrl-C does not end that
+            threading.Thread(
+                target=_send, args=(file, viewer.data_url), name="send flight", daemon=True
+            ).start()
             if open_browser and has_display():
                 webbrowser.open(viewer.page_url)
         while not stop.is_set() and viewer.check():

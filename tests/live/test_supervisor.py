@@ -220,6 +220,7 @@ def test_a_second_signal_kills_at_once(start, grace_s, writes_file):
     supervisor.interrupt()
     supervisor.read_until("simulator: closed")
     time.sleep(0.5)  # the grace of others is over
+    assert supervisor.process.poll() is None
     supervisor.interrupt()
     assert any(line.startswith("controller had not ended after") for line in supervisor.rest())
     assert supervisor.process.returncode == 130

@@ -98,6 +98,35 @@ def test_a_served_file_is_all_there_and_costs_nothing_more(tmp_path):
     assert scalars(read(saved), "/speed") == [(k * 10_000_000, [k]) for k in range(100)]
 
 
+def test_a_signal_ends_it_while_its_server_takes_nothing(monkeypatch, tmp_path):
+    """The stand-in listens, and reads nothing: Rerun would wait for it, whatever signals come."""
+    silent, shown = tmp_path / "rerun", tmp_path / "shown.rrd"
+    silent.write_text(
+        f"#!{sys.executable}\n"
+        "import signal, socket, sys\n"
+        "ports = (int(sys.argv[sys.argv.index(o) + 1]) for o in ('--port', '--web-viewer-port'))\n"
+        "servers = [socket.create_server(('127.0.0.1', port)) for port in ports]\n"
+        "signal.pause()\n"
+    )
+    silent.chmod(0o755)
+    monkeypatch.setenv("RERUN_CLI_PATH", str(silent))
+    logged = rr.RecordingStream("neurosim")
+    logged.save(shown)
+    logged.log("text", rr.TextDocument("hello"))
+    logged.disconnect()
+    code = "import sys; from pathlib import Path; from neurosim_core.view.rerun_viewer import show_file\n"
+    code += "sys.exit(show_file(Path(sys.argv[1]), web=True, open_browser=False))"
+    with subprocess.Popen([sys.executable, "-c", code, shown], stdout=subprocess.PIPE, text=True) as viewer:
+        try:
+            assert viewer.stdout is not None
+            assert viewer.stdout.readline().startswith("open ")
+            time.sleep(0.5)  # Rerun has begun to wait
+            viewer.terminate()
+            assert viewer.wait(5.0) == 130  # it took 10 s
+        finally:
+            viewer.kill()
+
+
 def test_ports_differ():
     """A port that was free a moment ago is often the next one that is handed out."""
     for _ in range(50):
