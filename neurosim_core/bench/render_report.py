@@ -170,7 +170,8 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         for label, at in marks.items():
             draw(at, color="0.45", linestyle=":", linewidth=1.2, label=label, marker="none")
     axes.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
-    axes.set(xscale="log" if "x" in panel.log else axes.get_xscale())
+    if "x" in panel.log:  # setting a scale forgets the names on an axis of names
+        axes.set(xscale="log")
     axes.set(yscale="log" if "y" in panel.log else "linear", ylim=(panel.y_min, panel.y_max))
     for axis in (axes.xaxis, axes.yaxis):
         low, high = sorted(axis.get_view_interval())

@@ -79,7 +79,8 @@ def test_stiff_flights_are_judged_and_refusals_kept():
     rows = dynamics._hard(cases, Options(quick=True))
     outcome = {(row["flight"], row["method"]): row["outcome"] for row in rows}
     assert outcome["1e-6 s", RKMK4] == "flown"
-    assert outcome["slender", RKMK4].startswith("refused: Value error")
+    assert outcome["slender", RKMK4].startswith("refused: inertia_kg_m2: ")
+    assert outcome["slender", RKMK4].endswith(", got [0.0001, 0.001, 0.01]")
     claim = dynamics._hard_claim("all", rows, 1e-8)
     assert claim.met
     assert "slender" in claim.measured

@@ -80,6 +80,13 @@ def test_a_chapter_survives_json(tmp_path):
     assert read_chapter(tmp_path, "other") is None
 
 
+def test_an_axis_of_names_shows_them():
+    def drawn(x):
+        return draw_plot(Plot("runs", "", [Panel(series=[Series(label="", x=x, y=[1.0, 2.0])])]))
+
+    assert drawn(["IMU only", "all"]) != drawn([0, 1])
+
+
 def test_the_page_escapes_and_counts():
     page = html_page([chapter()], {"flight-plot": "cGljdHVyZQ=="})
     assert "A &lt;flight&gt;" in page
