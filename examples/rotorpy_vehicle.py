@@ -19,7 +19,8 @@ try:
 except ImportError as error:
     raise SystemExit(f"this example needs RotorPy ({error}): pip install -e '.[dev]'") from None
 
-_NAMES = dict(zip(ns.vehicle.MultirotorState._fields, ("x", "v", "q", "w", "rotor_speeds"), strict=True))
+State = ns.vehicle.MultirotorState
+_NAMES = dict(zip(State._fields, ("x", "v", "q", "w", "rotor_speeds"), strict=True))
 
 
 @ns.register("vehicle", "rotorpy")
@@ -44,24 +45,19 @@ class RotorPyVehicle(ns.vehicle.HostVehicle):
 
     def __init__(self, airframe: str, context: ns.vehicle.VehicleContext) -> None:
         super().__init__(ns.preset(airframe), context)
-        parameters = importlib.import_module(f"rotorpy.vehicles.{airframe}_params")
-        self._vehicle = Multirotor(parameters.quad_params)
+        self._vehicle = Multirotor(importlib.import_module(f"rotorpy.vehicles.{airframe}_params").quad_params)
 
-    def move(
-        self, state: ns.vehicle.MultirotorState, command: NDArray[np.float64], duration_s: float
-    ) -> ns.vehicle.MultirotorState:
+    def move(self, state: State, command: NDArray[np.float64], duration_s: float) -> State:
         """Let RotorPy integrate."""
         later = self._vehicle.step(self._told(state), {"cmd_motor_speeds": command}, duration_s)
-        return ns.vehicle.MultirotorState(*(later[name] for name in _NAMES.values()))
+        return State(*(later[name] for name in _NAMES.values()))
 
-    def acceleration(
-        self, state: ns.vehicle.MultirotorState, command: NDArray[np.float64]
-    ) -> ns.vehicle.Acceleration:
+    def acceleration(self, state: State, command: NDArray[np.float64]) -> ns.vehicle.Acceleration:
         """Ask RotorPy for the derivatives; IMUs need them."""
         rates = self._vehicle.statedot(self._told(state), {"cmd_motor_speeds": command}, 0.0)
         return ns.vehicle.Acceleration(linear=rates["vdot"], angular=rates["wdot"])
 
-    def _told(self, state: ns.vehicle.MultirotorState) -> dict[str, Any]:
+    def _told(self, state: State) -> dict[str, Any]:
         return {_NAMES[name]: value for name, value in state._asdict().items()} | {"wind": np.zeros(3)}
 
 
