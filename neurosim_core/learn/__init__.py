@@ -6,6 +6,7 @@ Needs the extra `learn`.
 from __future__ import annotations
 
 import importlib
+import importlib.util
 from typing import TYPE_CHECKING, Any
 
 from neurosim_core.install import install_hint
@@ -56,3 +57,6 @@ def need(*modules: str) -> Any:
 
 
 __getattr__, __dir__, __all__ = lazy_names(__name__, __file__, lambda: need("torch"))
+for _name, _library in {"RslRlEnv": "rsl_rl", "Sb3Env": "stable_baselines3", "SkrlEnv": "skrl"}.items():
+    if importlib.util.find_spec(_library) is None:  # else `help` and `import *` would need all of them
+        __all__.remove(_name)
