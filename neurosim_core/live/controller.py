@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import os
 import sys
 import threading
 import time
@@ -363,7 +364,10 @@ def _owner(node: Node, source: int) -> str:
 
 def _difference(config: SimulationConfig, announced: SimulationConfig) -> str:
     """Say how the scene of a configuration differs from that of a simulator; nothing if it does not."""
-    here, there = config.scene.model_dump(mode="json"), announced.scene.model_dump(mode="json")
+    here, there = (each.scene.model_dump(mode="json") for each in (config, announced))
+    for scene in (here, there):
+        if "file" in scene:  # each process may have its own folder, or its own machine
+            scene["file"] = os.path.basename(scene["file"])
     keys = [key for key in here if here[key] != there.get(key)]
     if "kind" in keys:
         keys = ["kind"]

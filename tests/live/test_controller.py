@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from processes import SOON_S, wait_for
 from rich.status import Status
+from small_room import room_scene
 
 from cortex import Node, reliable
 from cortex.messages import Odometry, RotorSpeeds, Simulation, SimulatorStatus
@@ -370,20 +371,24 @@ def test_fly_serves_one_simulator_after_the_other(start_fly, paths):
 def test_fly_takes_the_vehicles_that_it_is_told(start_fly, tmp_path):
     """With settings of its own, in the mode that it is told, and SIGTERM ends it at once.
 
-    That the simulator has another scene is said.
+    That the simulator has another scene is said; it may have the same in another folder.
     """
     settings = tmp_path / "scene.yaml"
-    config = {**CONFIG, "vehicles": {"red": {}, "blue": {}}}
+    config = {**CONFIG, "scene": room_scene(tmp_path), "vehicles": {"red": {}, "blue": {}}}
     settings.write_text(to_yaml(load_config(config)))
     process = start_fly(str(settings), "--vehicle", "blue", "--mode", "position")
     with Node("simulator") as node:
         stage = Stage(node, "blue", "position")
-        simulator = Simulator(node, {**config, "scene": {**CONFIG["scene"], "rooms": 1}})
+        simulator = Simulator(
+            node, {**config, "scene": {**config["scene"], "file": "room.ply", "unit_m": 2.0}}
+        )
         stage.send(0)
         start = plan_paths(load_config(config))["blue"].evaluate([0])
         assert stage.hear(60.0) == (0, np.array([*start.position[0], start.yaw[0]]).tobytes())
         assert simulator.stages["red"].odometry.subscriber_count == 0
-        process.wait_until_said("another scene, where the path may meet walls: scene.rooms is 1, here 2\n")
+        process.wait_until_said(
+            "another scene, where the path may meet walls: scene.unit_m is 2.0, here None\n"
+        )
         process.process.send_signal(signal.SIGTERM)
         assert process.process.wait(SOON_S) == 130
     assert "interrupted" in process.said
