@@ -109,6 +109,6 @@ def test_the_tutorial_decodes_the_events_of_the_bridge() -> None:
         200_000, (t % 5).astype(np.uint16), (t % 3).astype(np.uint16), t, (t % 2).astype(np.uint8), 5, 3
     )
     convert = next(rule.convert for rule in RULES if rule.ros_type == EVENTS)
-    seen = namespace["see"](cdr.decode(convert(events, Context(vehicle="drone")), EVENTS))
+    seen = namespace["on_packet"](cdr.decode(convert(events, Context(vehicle="drone")), EVENTS))
     for mine, read in zip((t, events.x, events.y, events.polarity), seen, strict=True):
         np.testing.assert_array_equal(read, mine)
