@@ -177,7 +177,7 @@ def test_a_stopped_lossy_reader_never_holds_up_a_reliable_one(make_node, start_c
         child.ask(do="subscriber", topic="/numbers", type="Number", policy=policy)
     publisher = make_node().publisher("/numbers", Number)
     assert publisher.wait_for_subscribers(2, SOON_S)
-    count = 20_000
+    count = 40_000  # more than the ring of small messages holds
     with stopped.stopped():
         steady.say(do="receive", topic="/numbers", until=count - 1)
         assert all(publisher.publish(Number(value, value)) for value in range(count))
