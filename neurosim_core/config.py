@@ -309,6 +309,11 @@ def load_config(
         raise ConfigError(describe_errors(origin, list(_explain(error, raw)), options or {}, given)) from None
 
 
+def as_config(config: SimulationConfig | Mapping[str, Any] | str | Path | None) -> SimulationConfig:
+    """Return loaded settings as they are; load others, see `load_config`."""
+    return config if isinstance(config, SimulationConfig) else load_config(config)
+
+
 def to_yaml(config: SimulationConfig, *, comments: bool = False) -> str:
     """Return a configuration as YAML that `load_config` reads back to an equal one.
 

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from neurosim_core import __version__
-from neurosim_core.config import SimulationConfig, load_config, to_yaml
+from neurosim_core.config import SimulationConfig, as_config, load_config, to_yaml
 from neurosim_core.flight_report import FlightReport, print_plan, print_report
 from neurosim_core.packets import Events, Packet
 from neurosim_core.record import Recording, RecordingHeader, RecordingWriter, describe_sensors
@@ -82,7 +82,7 @@ def fly(
         OSError: The folder cannot be written to, or the disk is full.
         Exception: What a controller, sensor or sink of another package raises; the files hold all before.
     """
-    config = config if isinstance(config, SimulationConfig) else load_config(config)
+    config = as_config(config)
     folder = Path(folder)
     console = console or Console(soft_wrap=not sys.stdout.isatty())  # no lines broken in a pipe
     report = FlightReport()
@@ -124,8 +124,13 @@ def fly(
         console.print(text, style="yellow", markup=False, soft_wrap=True)
 
     on_stop: list[Callable[[], object]] = []
-    context = {"folder": folder, "stem": "flight", "model": model, "header": header_of(model)}
-    context["begin_s"] = begin
+    context = {
+        "folder": folder,
+        "stem": "flight",
+        "model": model,
+        "header": header_of(model),
+        "begin_s": begin,
+    }
     with (
         stop_at_signals(stop, on_stop=lambda: [stop_waiting() for stop_waiting in on_stop]),
         Sinks(sinks, say=say, on_stop=on_stop, **context) as files,

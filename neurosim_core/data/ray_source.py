@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from neurosim_core.config import SimulationConfig, load_config
+from neurosim_core.config import SimulationConfig, as_config
 from neurosim_core.data.batch import Sample
 from neurosim_core.data.make import DatasetPlan, fly, stretches_of, write_whole
 from neurosim_core.data.sources import RunSource, fields_of, numbered
@@ -83,7 +83,7 @@ class RaySource:
         first: int = 0,
         flights: int | None = None,
     ) -> None:
-        self._config = config if isinstance(config, SimulationConfig) else load_config(config)
+        self._config = as_config(config)
         self._address = address
         self._firsts = [first + SEEDS_APART * n for n in range(simulators)]
         self._flights = flights

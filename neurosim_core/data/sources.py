@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from neurosim_core.config import SimulationConfig, load_config
+from neurosim_core.config import SimulationConfig, as_config
 from neurosim_core.data.batch import Sample
 from neurosim_core.data.windows import PacketWindows, WindowConfig, choose_sensors, field_of
 from neurosim_core.packets import Events, Packet, schema_of
@@ -59,7 +59,7 @@ class RunSource:
     """
 
     def __init__(self, config: SimulationConfig | Mapping[str, Any]) -> None:
-        self._config = config if isinstance(config, SimulationConfig) else load_config(config)
+        self._config = as_config(config)
         self.skipped_count = 0
 
     def samples(self, config: WindowConfig) -> Iterator[Sample]:

@@ -239,11 +239,12 @@ def _end(children: Sequence[_Child], console: Console, caught: Sequence[int], gr
     while running := [child for child in running if child.poll() is None]:
         waited_s = time.monotonic() - begin_s
         is_late, at_once = waited_s >= grace_s, len(caught) > caught_before
-        for child in running:
-            if at_once or (is_late and not child.part.writes_file):
-                child.kill()
-                with contextlib.suppress(OSError):  # the console is gone
-                    _say(console, f"{child.part.name} had not ended after {waited_s:.1f} s and was killed")
+        late = [child for child in running if at_once or (is_late and not child.part.writes_file)]
+        for child in late:
+            child.kill()
+            with contextlib.suppress(OSError):  # the console is gone
+                _say(console, f"{child.part.name} had not ended after {waited_s:.1f} s and was killed")
+        running = [child for child in running if child not in late]
         time.sleep(_LOOK_S)
 
 

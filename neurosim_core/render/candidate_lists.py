@@ -117,8 +117,10 @@ def choose_candidate_lists(
         return requested
     widest = max((pixel_rad for least, pixel_rad in _AUTO if instant_count >= least), default=0.0)
     sample_count = max(1, len(rays) - 1)  # each of which has its share of the pixel
-    spreads_rad = np.sort(rays[..., 3], axis=None)  # np.median imports numpy.ma
-    pixel_rad = float(spreads_rad[len(spreads_rad) // 2]) * math.sqrt(sample_count)
+    spreads_rad = rays[..., 3].ravel()
+    middle = [(len(spreads_rad) - 1) // 2, len(spreads_rad) // 2]
+    median_rad = np.partition(spreads_rad, middle)[middle].mean()  # np.median imports numpy.ma
+    pixel_rad = float(median_rad) * math.sqrt(sample_count)
     small = pixel_rad <= widest and face_count * pixel_rad**2 <= _AUTO_FACES_MAX
     pays = small if is_cuda else not embree
     return CandidateListConfig() if pays and looks_forward(rays) else None

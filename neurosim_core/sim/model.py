@@ -15,10 +15,9 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from neurosim_core.clock import Rate, to_ns
-from neurosim_core.config import SimulationConfig, load_config
+from neurosim_core.config import SimulationConfig, as_config
 from neurosim_core.garbage import pause_collection
 from neurosim_core.path_process import NotPlannedError, PlanningProcess
 from neurosim_core.render.renderer import upload_scene
@@ -33,7 +32,7 @@ from neurosim_core.sim.schedule import Schedule
 from neurosim_core.trajectory import CollisionFreeConfig, Path, check_thrust, make_path
 from neurosim_core.trajectory.shapes import HoverConfig, hover
 from neurosim_core.vehicle import MultirotorConfig
-from neurosim_core.warp_start import find_device
+from neurosim_core.warp_start import find_device, start_device
 
 _POSE_RATE_HZ = 500.0
 """Lowest rate at which poses are recorded for rays with times of their own [Hz]. For rotors with a time
@@ -89,7 +88,7 @@ def make_model(
         ValueError: There are several vehicles, the scene cannot be loaded, no path exists, or the device is
             not there.
     """
-    config = config if isinstance(config, SimulationConfig) else load_config(config)
+    config = as_config(config)
     if len(config.vehicles) > 1:
         raise ValueError(
             f"this flies one vehicle, got {', '.join(config.vehicles)}: `neurosim up` flies several at once"
@@ -156,7 +155,7 @@ def _make_fleet(
     has_cameras = any(plan_render_groups(member.sensors) for member in members.values())
     bodies = make_bodies(config.bodies) if has_cameras else ()
     with ThreadPoolExecutor(max_workers=5) as executor:
-        context = executor.submit(wp.zeros, 1, device=device)  # creates the CUDA context
+        context = executor.submit(start_device, device)  # creates the CUDA context
 
         def map_scene() -> FreeSpace:
             context.result()  # Warp makes a device's streams at its first use, which must be in one thread

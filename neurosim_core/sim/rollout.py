@@ -16,7 +16,7 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
-from neurosim_core.config import SimulationConfig, load_config
+from neurosim_core.config import SimulationConfig, as_config
 from neurosim_core.control import CommandMode
 from neurosim_core.packets import Odometry, Packet
 from neurosim_core.runtime.timing import timed
@@ -50,7 +50,7 @@ def run(config: SimulationConfig | Mapping[str, Any] | str | FilePath | None = N
     Raises:
         DynamicsError: The integration failed; all packets before its stamp have been yielded.
     """
-    config = config if isinstance(config, SimulationConfig) else load_config(config)
+    config = as_config(config)
     model = make_model(config, meanwhile=warm_flight)
     yield from run_model(model, make_state(model))
 

@@ -17,7 +17,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from neurosim_core.config import SimulationConfig, load_config
+from neurosim_core.config import SimulationConfig, as_config
 from neurosim_core.control import CommandMode
 from neurosim_core.render.camera import Lens
 from neurosim_core.scene.bodies import throw_bodies
@@ -417,7 +417,7 @@ class Simulation:
 def _one_vehicle(
     config: SimulationConfig | Mapping[str, Any] | str | Path | None, device: str | None
 ) -> SimulationConfig:
-    chosen = config if isinstance(config, SimulationConfig) else load_config(config)
+    chosen = as_config(config)
     if len(chosen.vehicles) > 1:
         raise ValueError(
             f"a world holds one vehicle, got {', '.join(chosen.vehicles)}: `neurosim serve` flies several"
